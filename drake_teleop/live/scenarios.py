@@ -37,7 +37,7 @@ SCENE_NAMES = ("own", *_SHIPPED_SCENES)
 
 
 def live_scenario(scenario: Scenario) -> Scenario:
-    """Return the scenario without intended motion, task and settling time; faults do not end it."""
+    """Remove intended motion, task, settling time and end by faults; set Runge-Kutta integration."""
     return replace(
         scenario,
         operator__intent=[],
@@ -50,7 +50,7 @@ def live_scenario(scenario: Scenario) -> Scenario:
 
 
 def with_task_space_device(scenario: Scenario) -> Scenario:
-    """Return the scenario with a task-space device if its master is a serial arm."""
+    """Return the scenario, with a Haply Inverse3 in place of a master that is a serial arm."""
     if scenario.master.model not in (PHANTOM_NAME, LEADER_NAME):
         return scenario
     return replace(scenario, master=Master(model="haply_inverse3"))

@@ -57,7 +57,7 @@ _MAX_CONNECTED_PAGES = 8
 _ASYNCIO_ITERATIONS_PER_MESSAGE = 3
 _MAX_UNSENT_BYTES_OF_PAGE = 2**18  # unsent bytes above which a slow page misses frames
 # Timeouts of the clients and of the drive's thread [s].
-_PAGE_CLOSE_TIMEOUT_S, _THREAD_END_TIMEOUT_S = 1.0, 4.0
+_PAGE_CLOSE_TIMEOUT_S, _THREAD_TIMEOUT_S = 1.0, 4.0
 # All other log entries of websockets are failed connections, which clients cause.
 _WEBSOCKET_LOGGER = logging.getLogger("drake_teleop.live.server")
 _WEBSOCKET_LOGGER.addFilter(lambda record: record.msg == "connection handler failed")
@@ -125,10 +125,10 @@ class LiveDrive:
             self._stop_threads_or_exit_process()
         self._raise_thread_failure()
 
-    def announce_and_wait(self, who: str) -> str:
-        """Print the page's address; wait for Ctrl-C or SIGTERM and return its name, or "stop"."""
+    def announce_and_wait(self, title: str) -> str:
+        """Print `title` and page address; wait for Ctrl-C or SIGTERM; return its name, or "stop"."""
         condition = f"the simulation waits until this page is open{self._start_condition}"
-        print(f"{who} at {self.url}\n{condition}; Ctrl-C ends it", flush=True)
+        print(f"{title} at {self.url}\n{condition}; Ctrl-C ends it", flush=True)
         try:
             self.wait()
             return "stop"
@@ -149,14 +149,14 @@ class LiveDrive:
     def _stop_threads_or_exit_process(self) -> None:
         # Python may crash at exit while compiled code runs.
         self._stop.set()
-        end = time.monotonic() + _THREAD_END_TIMEOUT_S
+        end = time.monotonic() + _THREAD_TIMEOUT_S
         for thread in self._threads:
             while thread.is_alive() and (rest := end - time.monotonic()) > 0.0:
                 with contextlib.suppress(KeyboardInterrupt):
                     thread.join(rest)
         if any(thread.is_alive() for thread in self._threads):
             lost = "; its record may lack two seconds" if self._threads[0].is_alive() else ""
-            _print_to_stderr(f"error: drive: not ended within {_THREAD_END_TIMEOUT_S:g} s{lost}")
+            _print_to_stderr(f"error: the drive did not end within {_THREAD_TIMEOUT_S:g} s{lost}")
             sys.stdout.flush()
             os._exit(2)
 
