@@ -37,7 +37,7 @@ SCENE_NAMES = ("own", *_SHIPPED_SCENES)
 
 
 def live_scenario(scenario: Scenario) -> Scenario:
-    """Remove intended motion, task, settling time and end by faults; set Runge-Kutta integration."""
+    """Remove intended motion, task, settling and end by faults; set Runge-Kutta integration."""
     return replace(
         scenario,
         operator__intent=[],

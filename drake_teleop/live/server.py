@@ -126,7 +126,7 @@ class LiveDrive:
         self._raise_thread_failure()
 
     def announce_and_wait(self, title: str) -> str:
-        """Print `title` and page address; wait for Ctrl-C or SIGTERM; return its name, or "stop"."""
+        """Print `title` and page address; wait for the end; return its cause, such as "Ctrl-C"."""
         condition = f"the simulation waits until this page is open{self._start_condition}"
         print(f"{title} at {self.url}\n{condition}; Ctrl-C ends it", flush=True)
         try:
