@@ -113,7 +113,7 @@ def eliminate_command(
         summary["notes"] += found.detection.notes
     elif not found.log.static:
         few = f"{len(found.log)} samples are too few to separate contact from noise"
-        required = f"record more than {MIN_NOISE_FLOOR_SAMPLES} besides both ends"
+        required = f"record at least {MIN_NOISE_FLOOR_SAMPLES} besides both ends"
         summary["notes"].append(f"contact flags are all False: {few}; {required}")
     summary = files.to_json_data(
         summary

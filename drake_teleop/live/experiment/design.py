@@ -73,7 +73,7 @@ class ContactDetection(_CommonTaskFields):
 class ApparentMass(_CommonTaskFields):
     """Task to identify the interval (of two) with the heavier tool; the hand moves in both."""
 
-    low: float = quantity(0.004, "kg", 1e-4, 10.0, "smallest mass added to the tool, at the hand")
+    low: float = quantity(0.004, "kg", 1e-4, 10.0, "smallest added mass at the hand")
     high: float = quantity(0.15, "kg", 1e-3, 10.0, "largest added mass, also for practice")
     interval: float = quantity(4.0, "s", 0.5, 60.0, "length of an interval")
 
