@@ -76,7 +76,7 @@ def linked(seconds: float) -> tuple[dict[str, float], np.ndarray]:
                 np.array([0.0, 0.0, max(-WALL * state.position[2], 0.0), 0.0, 0.0, 0.0])
             )
             spent.append((time.perf_counter() - began, time.thread_time() - cpu))
-            behind.append(state.behind)
+            behind.append(state.force_age_s)
         lasted = time.perf_counter() - start
         found = json.loads(told.read_text())
         figures = {

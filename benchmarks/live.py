@@ -29,7 +29,7 @@ import numpy as np
 
 from drake_teleop.common.progress import show_no_progress
 from drake_teleop.lab.identified_load import identified_load
-from drake_teleop.live.inputs import NETWORKS, SLICE_MS
+from drake_teleop.live.inputs import NETWORK_NAMES, SLICE_MS
 from drake_teleop.live.live import FRAME_PERIOD_S, Live, without_garbage_collection
 from drake_teleop.live.page_scene import PageScene
 from drake_teleop.live.scenarios import live_scenario
@@ -101,7 +101,7 @@ def slices(seconds: float) -> dict[str, float]:
     cells = list(product(NETWORK_PRESETS, METHODS))
     drives: dict[tuple[str, str], list[list[float]]] = {cell: [] for cell in cells}
     for network, method in cells * DRIVES:
-        choice = {"network": NETWORKS.index(network), "method": list(METHODS).index(method)}
+        choice = {"network": NETWORK_NAMES.index(network), "method": list(METHODS).index(method)}
         drives[network, method].append(spent(Session(scenario, load), choice, seconds))
     for network, method in cells:
         counted = np.min(drives[network, method], axis=0)

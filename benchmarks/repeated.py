@@ -23,7 +23,7 @@ import numpy as np
 
 from drake_teleop.common.progress import show_no_progress
 from drake_teleop.lab.identified_load import identified_load
-from drake_teleop.live.inputs import INPUT_RANGES, NETWORKS, SLICE_MS, Inputs
+from drake_teleop.live.inputs import INPUT_RANGES, NETWORK_NAMES, SLICE_MS, Inputs
 from drake_teleop.live.scenarios import live_scenario
 from drake_teleop.live.session import RecordedDrive, Session, read_drive
 from drake_teleop.station.passivity.methods import METHODS
@@ -38,7 +38,11 @@ STATION_INPUTS = (
     (0.30, {"object": 0}),
     (
         0.40,
-        {"network": NETWORKS.index("custom"), "method": list(METHODS).index("tdpa"), "delay": 200},
+        {
+            "network": NETWORK_NAMES.index("custom"),
+            "method": list(METHODS).index("tdpa"),
+            "delay": 200,
+        },
     ),
     (0.50, {"delay": 350, "jitter": 10, "loss": 20}),
     (0.60, {"grip": 2}),

@@ -14,13 +14,13 @@ import numpy as np
 
 import drake_teleop as dt
 from drake_teleop.lab.identified_load import identified_load
-from drake_teleop.live.inputs import METHODS, NETWORKS
+from drake_teleop.live.inputs import METHODS, NETWORK_NAMES
 from drake_teleop.live.scenarios import live_scenario
 from drake_teleop.live.session import Session
 
 scenario = live_scenario(dt.LoadScenario("contact_transition"))
 session = Session(scenario, identified_load(scenario))
-internet = {"network": NETWORKS.index("internet"), "method": list(METHODS).index("ledger")}
+internet = {"network": NETWORK_NAMES.index("internet"), "method": list(METHODS).index("ledger")}
 while session.ms < 3500:
     t = 1e-3 * session.ms
     wanted = {"z": round(-7500 * min(t, 1.0))}  # in steps of 10 um

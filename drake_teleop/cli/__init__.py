@@ -7,7 +7,7 @@ from drake_teleop.common.interruption import install_interrupt_handlers
 
 
 def start() -> None:
-    """Install signal handlers, then import and run the command line; status 130: interrupted."""
+    """Install signal handlers, import and run the command line; exit with 130 if interrupted."""
     install_interrupt_handlers()  # first: imports of C code can lose a KeyboardInterrupt
     gc.set_threshold(20_000)  # with 700, collections take a tenth of the compile time
     try:

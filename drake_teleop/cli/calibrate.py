@@ -101,7 +101,7 @@ def make_progress_table(evaluation: RecordEvaluation, tolerance: tolerances.Tole
         table.add_row(
             *(entry, *numbers, f"{sizes[k]:.3g}" if np.isfinite(sizes[k]) else "?", units[k]),
             _make_accuracy_bar(half, is_known=bool(evaluation.is_known[k])),
-            _accuracy_verdict_of_entry(evaluation, k),
+            _describe_entry_accuracy(evaluation, k),
         )
     lines = [Text(line, style="red") for line in (*evaluation.doubts, evaluation.failure) if line]
     if evaluation.advice:
@@ -116,7 +116,7 @@ def _make_accuracy_bar(relative_half_width: float, *, is_known: bool) -> Text:
     return Text("█" * cells + "·" * (_BAR_CHARACTERS - cells), style=colour)
 
 
-def _accuracy_verdict_of_entry(evaluation: RecordEvaluation, index: int) -> str:
+def _describe_entry_accuracy(evaluation: RecordEvaluation, index: int) -> str:
     if evaluation.is_known[index]:
         return "known"
     if not np.isfinite(evaluation.relative_half_widths[index]):

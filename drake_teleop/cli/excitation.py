@@ -159,7 +159,7 @@ def summarize_excitation(excitation: Excitation) -> dict[str, Any]:
 
 
 def trajectory_table(excitation: Excitation) -> pl.DataFrame:
-    """Return the table of trajectory.csv: joint motion of one period at 1 kHz, with both ends."""
+    """Return the table of trajectory.csv: joint motion at 1 kHz from 0 to the period, inclusive."""
     period = excitation.trajectory.period
     t = np.linspace(0, period, round(period * CHECK_RATE_HZ) + 1)
     columns = {"t": t}

@@ -61,12 +61,12 @@ def _simulate_participants(
 ) -> None:
     from drake_teleop.live.experiment.simulated import make_apparatuses, simulate_participant
 
-    stations = make_apparatuses(experiment, scenarios)
+    apparatuses = make_apparatuses(experiment, scenarios)
 
     def print_progress(done: int, trials: int) -> None:
         print(f"\rparticipant {number} of {total}: trial {done} of {trials}", end="", flush=True)
 
     for number in range(1, total + 1):
         procedure = Procedure(experiment, number, store)
-        simulate_participant(procedure, stations, print_progress)
+        simulate_participant(procedure, apparatuses, print_progress)
     print()

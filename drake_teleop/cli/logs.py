@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common import files
 from drake_teleop.load.batch.methods import DEFAULT_METHOD
+from drake_teleop.load.contact.detection import MIN_NOISE_FLOOR_SAMPLES
 from drake_teleop.load.contact.noise_floor import STATISTIC_NAMES
 from drake_teleop.load.identification import PARAMETER_NAMES, Identification, load_of_object
 from drake_teleop.logs import processing, summaries
@@ -111,7 +112,9 @@ def eliminate_command(
     if found.detection is not None:
         summary["notes"] += found.detection.notes
     elif not found.log.static:
-        summary["notes"].append(f"{len(found.log)} samples are too few to tell contact from noise")
+        few = f"{len(found.log)} samples are too few to separate contact from noise"
+        required = f"record at least {MIN_NOISE_FLOOR_SAMPLES} besides both ends"
+        summary["notes"].append(f"contact flags are all False: {few}; {required}")
     summary = files.to_json_data(
         summary
         | summaries.summarize_wrenches(found)
@@ -319,7 +322,7 @@ def print_contact_detection_summary(summary: dict[str, Any], out: Path) -> None:
 
 
 def print_table_and_notes(table: Any, text: str, summary: dict[str, Any], out: Path) -> None:
-    """Print a table, `text`, the delay of the motion and the notes in `summary`, and `out`."""
+    """Print a table, `text`, the motion delay and notes in `summary`, and the output folder."""
     from rich.console import Console
 
     lines = [text]

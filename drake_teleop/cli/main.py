@@ -1,4 +1,4 @@
-"""Commands of `drake-teleop` (long: with all options). Large packages are imported on demand."""
+"""Commands of `drake-teleop` (long: one file for all commands). Imports packages on demand."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from drake_teleop.common.version import __version__
 
 @click.group(cls=option.CommandGroup, context_settings=option.HELP_SETTINGS)
 @click.version_option(__version__, prog_name="drake-teleop")
-@option.path(
+@option.path_option(
     "--register",
     "scripts",
     multiple=True,
@@ -30,7 +30,7 @@ from drake_teleop.common.version import __version__
 def cli(scripts: tuple[Path, ...]) -> None:
     """Bilateral teleoperation with non-contact force scaling: simulate it, or use it on logs.
 
-    Every command with --out writes its results by name into DIR/summary.json. A command with
+    Every command with --out writes its results (name: value) into DIR/summary.json. A command with
     invalid input exits with status 2 and one error line.
 
     The Tab key completes commands and names in bash (zsh, fish: zsh_source, fish_source) after
@@ -44,14 +44,13 @@ def cli(scripts: tuple[Path, ...]) -> None:
 
 @cli.command()
 @option.output_folder("reproduce")
-@option.seed()
-@option.quiet
+@option.seed_option()
+@option.quiet_option
 def reproduce(out: Path, **options: Any) -> int:
     """Repeat the paper's experiments.
 
     Writes figures and numbers of the paper (Kubus, Weidauer, Wahl 2009) and of the simulation, a
-    3D replay and report.html.
-    The exit status is 1 if a number is outside its accepted range.
+    3D replay and report.html. The exit status is 1 if a number is outside its accepted range.
     """
     from drake_teleop.lab.reproduction.report import describe_unaccepted
     from drake_teleop.lab.reproduction.reproduce import reproduce_command
@@ -64,11 +63,11 @@ def reproduce(out: Path, **options: Any) -> int:
 
 @cli.command()
 @click.argument("scenario", type=option.SCENARIO_NAME_OR_PATH_TYPE, required=False)
-@option.path("--inputs", metavar="DIR")
+@option.path_option("--inputs", metavar="DIR")
 @option.output_folder("run")
-@option.seed()
+@option.seed_option()
 @click.option("--fresh", is_flag=True)
-@option.quiet
+@option.quiet_option
 def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) -> None:
     """Simulate one scenario, or repeat a session of `drive`.
 
@@ -93,16 +92,16 @@ def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) ->
 
 @cli.command()
 @click.argument("scenario", type=option.SCENARIO_NAME_OR_PATH_TYPE, default="contact_transition")
-@option.path("--record", metavar="DIR")
-@option.integer("--port", limits=(0, 65535), default=0, show_default="any free port")
+@option.path_option("--record", metavar="DIR")
+@option.int_option("--port", limits=(0, 65535), default=0, show_default="any free port")
 @click.option("--no-browser", is_flag=True)
 @click.option("--device", metavar="ADDRESS")
 @click.option("--study", metavar="FILE")
-@option.path("--results", default=Path("out/experiment"), metavar="DIR")
-@option.integer(
-    "--participant", limits=(1, 9999), show_default="the first with trials left, or a new one"
+@option.path_option("--results", default=Path("out/experiment"), metavar="DIR")
+@option.int_option(
+    "--participant", limits=(1, 9999), show_default="first unfinished participant, or a new one"
 )
-@option.integer("--simulated", limits=(0, 9999), default=0, show_default=False)
+@option.int_option("--simulated", limits=(0, 9999), default=0, show_default=False)
 def drive(
     scenario: str,
     record: Path | None,
@@ -180,7 +179,7 @@ def parts() -> None:
 @click.argument("folder", type=option.UTF8_PATH_TYPE)
 @click.option("--scenario", metavar="SCENARIO")
 @option.output_folder("replay")
-@option.quiet
+@option.quiet_option
 def replay(folder: Path, out: Path, **options: Any) -> None:
     """Show a logged run in 3D.
 
@@ -197,16 +196,16 @@ def replay(folder: Path, out: Path, **options: Any) -> None:
 
 @cli.command()
 @click.argument("log", type=option.UTF8_PATH_TYPE)
-@option.gripper_file
+@option.gripper_file_option
 @click.option(
     "--method",
     type=option.RegisteredName("estimator", "ordinary", "whitened", "robust", "consistent"),
     default="consistent",
 )
 @option.output_folder("identify")
-@option.cutoff_hz
-@option.delay
-@option.quiet
+@option.cutoff_option
+@option.delay_option
+@option.quiet_option
 def identify(log: Path, out: Path, **options: Any) -> None:
     """Identify the load on the sensor from a log.
 
@@ -224,24 +223,24 @@ def identify(log: Path, out: Path, **options: Any) -> None:
 
 @cli.command()
 @click.argument("log", type=option.UTF8_PATH_TYPE)
-@option.load_file(required=True)
-@option.gripper_file
-@option.sigma
+@option.load_file_option(required=True)
+@option.gripper_file_option
+@option.sigma_option
 @click.option("--sigma-object", type=option.SCALE_TYPE)
-@option.sigma_weight_and_sigma_inertia
-@option.gamma
-@option.number("--eta", limits=(0, 1))
-@option.choice("--offsets", ["record", "load"], "record")
-@option.number("--untouched", "untouched_s", limits=(0, 36000), nargs=2, metavar="START STOP")
+@option.sigma_weight_and_inertia_options
+@option.gamma_option
+@option.float_option("--eta", limits=(0, 1))
+@option.choice_option("--offsets", ["record", "load"], "record")
+@option.float_option("--untouched", "untouched_s", limits=(0, 36000), nargs=2, metavar="START STOP")
 @click.option("--causal", type=click.Choice(["delayed", "predicted"]))
-@option.number(
+@option.float_option(
     "--causal-tare", "causal_tare_s", limits=(0, 36000), min_open=True, metavar="SECONDS"
 )
-@option.free_motion_log
+@option.free_motion_log_option
 @option.output_folder("eliminate")
-@option.cutoff_hz
-@option.delay
-@option.quiet
+@option.cutoff_option
+@option.delay_option
+@option.quiet_option
 def eliminate(log: Path, load: Path, out: Path, **options: Any) -> None:
     """Eliminate or scale non-contact forces in a log.
 
@@ -251,12 +250,12 @@ def eliminate(log: Path, load: Path, out: Path, **options: Any) -> None:
     Options:
         --sigma-object: With --gripper: scale of the object's non-contact wrench.  [default: value
             of --sigma]
-        --eta: With --gripper: as --sigma-object, without other scales; eliminates the gripper.
+        --eta: With --gripper: eliminate the gripper's wrench, scale the object's; no other scales.
         --offsets: Source of the sensor offsets: LOG (record) or the load file (load).
         --untouched: Start and end of a contact-free part of LOG that determines the offsets [s].
             [default: the whole LOG]
-        --causal: Add a causal result; delayed: late by the lag of the low-pass; predicted:
-            extrapolated over this lag.
+        --causal: Add the result of a causal low-pass; delayed: late by its lag; predicted:
+            extrapolated over the lag.
         --causal-tare: With --causal: length of the contact-free start of LOG that determines the
             offsets [s].  [default: offsets of the load file]
         --sigma: Scale of the non-contact wrench; with --gripper, of the gripper's.
@@ -268,13 +267,13 @@ def eliminate(log: Path, load: Path, out: Path, **options: Any) -> None:
 
 @cli.command()
 @click.argument("log", type=option.UTF8_PATH_TYPE)
-@option.load_file()
-@option.free_motion_log
-@option.choice("--statistic", ["level", "cusum", "glr"], "level")
+@option.load_file_option()
+@option.free_motion_log_option
+@option.choice_option("--statistic", ["level", "cusum", "glr"], "level")
 @option.output_folder("detect")
-@option.cutoff_hz
-@option.delay
-@option.quiet
+@option.cutoff_option
+@option.delay_option
+@option.quiet_option
 def detect(log: Path, out: Path, **options: Any) -> None:
     """Find contact in a log.
 
@@ -294,7 +293,7 @@ def detect(log: Path, out: Path, **options: Any) -> None:
 @click.argument("log", type=option.UTF8_PATH_TYPE)
 @click.argument("others", type=option.UTF8_PATH_TYPE, nargs=-1)
 @option.output_folder("inspect")
-@option.quiet
+@option.quiet_option
 def inspect(log: Path, others: tuple[Path, ...], out: Path, quiet: bool) -> None:
     """List the contents and suspicious parts of a log.
 
@@ -309,12 +308,12 @@ def inspect(log: Path, others: tuple[Path, ...], out: Path, quiet: bool) -> None
 
 @cli.command()
 @click.argument("path", type=option.UTF8_PATH_TYPE)
-@option.load_file()
+@option.load_file_option()
 @click.option("--identify", is_flag=True)
-@option.path("--description", metavar="FILE")
-@option.jobs
+@option.path_option("--description", metavar="FILE")
+@option.jobs_option
 @option.output_folder("dataset")
-@option.quiet
+@option.quiet_option
 def dataset(path: Path, out: Path, **options: Any) -> None:
     """Add contact wrenches to a robot-learning dataset.
 
@@ -334,17 +333,17 @@ def dataset(path: Path, out: Path, **options: Any) -> None:
 
 @cli.command()
 @click.argument("source")
-@option.load_file(required=True)
+@option.load_file_option(required=True)
 @click.option("--out", "sink", default="-", show_default=False, metavar="SINK")
-@option.sigma
-@option.sigma_weight_and_sigma_inertia
-@option.gamma
-@option.rate_hz()
+@option.sigma_option
+@option.sigma_weight_and_inertia_options
+@option.gamma_option
+@option.rate_option()
 @click.option("--predicted", is_flag=True)
 @click.option("--watch", is_flag=True)
-@option.path("--free", metavar="LOG")
+@option.path_option("--free", metavar="LOG")
 @click.option("--tare", is_flag=True)
-@option.integer("--control", limits=(1, 65535), metavar="PORT")
+@option.int_option("--control", limits=(1, 65535), metavar="PORT")
 @option.stream_options
 def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
     """Remove the load from a live wrench.
@@ -357,7 +356,7 @@ def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
     the source or with Ctrl-C.
 
     Options:
-        --out: Destination.  [default: stdout]
+        --out: Destination of the results.  [default: stdout]
         --predicted: Extrapolate the results over the low-pass lag.
         --watch: Flag contact, and a change of the load.
         --free: Log of free motion, whose noise sets the threshold of contact flags.
@@ -374,11 +373,11 @@ def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
 @cli.command()
 @click.argument("source")
 @click.argument("sink")
-@option.load_file(required=True)
-@option.sigma
-@option.sigma_weight_and_sigma_inertia
-@option.gamma
-@option.rate_hz(required=True)
+@option.load_file_option(required=True)
+@option.sigma_option
+@option.sigma_weight_and_inertia_options
+@option.gamma_option
+@option.rate_option(required=True)
 @click.option("--watch", is_flag=True)
 @option.stream_options
 @option.output_folder("ros2")
@@ -416,10 +415,10 @@ def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **op
 @cli.command()
 @click.argument("source")
 @click.option("--until", default="mass 0.5 %, com 0.5 mm, inertia 5 %", metavar="TOLERANCE")
-@option.number("--seconds", limits=(1, 36000), default=120.0)
+@option.float_option("--seconds", limits=(1, 36000), default=120.0)
 @option.stream_options
 @option.output_folder("calibrate")
-@option.quiet
+@option.quiet_option
 def calibrate(source: str, out: Path, **options: Any) -> int:
     """Identify a load from a live stream, with guidance.
 
@@ -447,11 +446,11 @@ _EXPORT_FORMAT_OPTION_TYPE = option.RegisteredName(
 @cli.command()
 @click.argument("identification", type=option.UTF8_PATH_TYPE)
 @click.option("--to", required=True, type=_EXPORT_FORMAT_OPTION_TYPE)
-@option.sensor_pose
-@option.choice("--sign", ["-1", "1"], "-1")
-@option.rate_hz()
-@option.cutoff_hz
-@option.sensor_range
+@option.sensor_pose_option
+@option.choice_option("--sign", ["-1", "1"], "-1")
+@option.rate_option()
+@option.cutoff_option
+@option.range_option
 @option.output_folder("export")
 def export(
     identification: Path, to: str, sensor_pose: tuple[float, ...] | None, sign: str, **options: Any
@@ -493,9 +492,9 @@ def export(
 
 
 @cli.command("sample-log")
-@option.seed_with_default_0
+@option.seed_with_default_0_option
 @option.output_folder("sample-log")
-@option.quiet
+@option.quiet_option
 def sample_log(out: Path, **options: Any) -> None:
     """Write a simulated log to try these commands on.
 
@@ -510,9 +509,9 @@ def sample_log(out: Path, **options: Any) -> None:
 
 @cli.command()
 @click.argument("scenario", type=option.SCENARIO_NAME_OR_PATH_TYPE)
-@option.choice("--direction", ["x", "y", "z"], "z")
+@option.choice_option("--direction", ["x", "y", "z"], "z")
 @option.output_folder("analyze")
-@option.quiet
+@option.quiet_option
 def analyze(scenario: str, out: Path, **options: Any) -> None:
     """Analyse stability and transparency of a scenario.
 
@@ -528,13 +527,13 @@ def analyze(scenario: str, out: Path, **options: Any) -> None:
 
 
 @cli.command("compare-passivity")
-@click.option("--networks", type=option.NAMES_TYPE)
-@click.option("--methods", type=option.NAMES_TYPE)
+@click.option("--networks", type=option.NAME_LIST_TYPE)
+@click.option("--methods", type=option.NAME_LIST_TYPE)
 @click.option("--scenario", default="contact_transition")
-@option.jobs
+@option.jobs_option
 @option.output_folder("compare-passivity")
-@option.seed_with_default_0
-@option.quiet
+@option.seed_with_default_0_option
+@option.quiet_option
 def compare_passivity(
     networks: tuple[str, ...] | None, methods: tuple[str, ...] | None, out: Path, **options: Any
 ) -> None:
@@ -556,13 +555,13 @@ def compare_passivity(
 
 @cli.command()
 @click.argument("scenario", type=option.SCENARIO_NAME_OR_PATH_TYPE)
-@click.option("--hands", type=option.NAMES_TYPE)
-@click.option("--walls", type=option.POSITIVE_NUMBERS_TYPE)
+@click.option("--hands", type=option.NAME_LIST_TYPE)
+@click.option("--walls", type=option.POSITIVE_NUMBER_LIST_TYPE)
 @click.option("--network")
-@option.choice("--task", ["press", "touch", "insert"], "press")
-@option.jobs
+@option.choice_option("--task", ["press", "touch", "insert"], "press")
+@option.jobs_option
 @option.output_folder("tune")
-@option.quiet
+@option.quiet_option
 def tune(
     scenario: str,
     out: Path,
@@ -580,7 +579,7 @@ def tune(
         --hands: Grips of the operator.  [default: light,firm]
         --walls: Wall stiffnesses [kN/m].  [default: 0.5,20]
         --network: Network preset.  [default: that of the scenario]
-        --task: Task; it sets the required stability margin of gamma.
+        --task: Task of the operator, which sets the required stability margin of gamma.
     """
     from drake_teleop.lab.tuning.tune import tune as tune_station
 
@@ -590,13 +589,13 @@ def tune(
 
 @cli.command()
 @click.argument("study", type=option.STUDY_NAME_OR_PATH_TYPE)
-@option.jobs
-@option.dask_cluster
+@option.jobs_option
+@option.dask_cluster_option
 @click.option("--shard", metavar="K/N")
 @click.option("--merge", is_flag=True)
-@option.skip_run_count_question
+@option.skip_run_count_question_option
 @option.output_folder("study")
-@option.quiet
+@option.quiet_option
 def study(study: Path, out: Path, **options: Any) -> None:
     """Run a scenario for varied values of its fields.
 
@@ -613,12 +612,12 @@ def study(study: Path, out: Path, **options: Any) -> None:
 
 
 @cli.command("scaling-study")
-@option.jobs
-@option.dask_cluster
-@option.integer("--repeats", limits=(1, 10**6))
-@option.skip_run_count_question
+@option.jobs_option
+@option.dask_cluster_option
+@option.int_option("--repeats", limits=(1, 10**6))
+@option.skip_run_count_question_option
 @option.output_folder("scaling-study")
-@option.quiet
+@option.quiet_option
 def scaling_study(out: Path, **options: Any) -> None:
     """Find the best force scales for a simulated operator.
 
@@ -635,19 +634,19 @@ def scaling_study(out: Path, **options: Any) -> None:
 
 @cli.command()
 @click.argument("scenario", type=option.SCENARIO_NAME_OR_PATH_TYPE, default="identification")
-@option.path("--model")
-@option.sensor_frame()
-@option.package_paths
-@click.option("--acceleration", type=option.POSITIVE_NUMBERS_TYPE, default=())
-@option.number("--payload", limits=(0, 1e4), min_open=True, metavar="KG")
-@option.choice("--criterion", ["kappa_w10", "kappa10", "kappa16", "A16", "D16"], "kappa_w10")
-@option.number("--period", limits=(0.5, 600), default=6.0, metavar="SECONDS")
-@option.integer("--harmonics", limits=(2, 20))
+@option.path_option("--model")
+@option.sensor_frame_option()
+@option.package_path_option
+@click.option("--acceleration", type=option.POSITIVE_NUMBER_LIST_TYPE, default=())
+@option.float_option("--payload", limits=(0, 1e4), min_open=True, metavar="KG")
+@option.choice_option("--criterion", ["kappa_w10", "kappa10", "kappa16", "A16", "D16"], "kappa_w10")
+@option.float_option("--period", limits=(0.5, 600), default=6.0, metavar="SECONDS")
+@option.int_option("--harmonics", limits=(2, 20))
 @click.option("--until", metavar="TOLERANCE")
-@option.number("--time", "seconds", limits=(0, 1e6), min_open=True, metavar="SECONDS")
-@option.seed_with_default_0
+@option.float_option("--time", "seconds", limits=(0, 1e6), min_open=True, metavar="SECONDS")
+@option.seed_with_default_0_option
 @option.output_folder("excite")
-@option.quiet
+@option.quiet_option
 def excite(scenario: str, out: Path, **options: Any) -> None:
     """Design a motion that excites all parameters of a load.
 
@@ -679,13 +678,13 @@ def excite(scenario: str, out: Path, **options: Any) -> None:
 
 @cli.command()
 @click.argument("folder", type=option.UTF8_PATH_TYPE)
-@option.path("--arm", required=True)
-@option.sensor_frame(required=True)
-@option.package_paths
-@option.path("--tool")
+@option.path_option("--arm", required=True)
+@option.sensor_frame_option(required=True)
+@option.package_path_option
+@option.path_option("--tool")
 @click.option("--device", default="phantom_premium_15", metavar="NAME")
 @click.option("--sensor", metavar="PRESET")
-@option.quiet
+@option.quiet_option
 def new(folder: Path, arm: Path, sensor_frame: str, **options: Any) -> None:
     """Create a station with your own arm.
 

@@ -15,7 +15,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
-from drake_teleop.common.config import short_text
+from drake_teleop.common.config import shorten_value
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import scenarios_dir, studies_dir
 from drake_teleop.common.registry import REGISTRIES
@@ -51,7 +51,7 @@ class ShippedOrPath(Utf8Path):
 UTF8_PATH_TYPE = Utf8Path(path_type=Path)
 SCENARIO_NAME_OR_PATH_TYPE = ShippedOrPath(scenarios_dir(), str)
 STUDY_NAME_OR_PATH_TYPE = ShippedOrPath(studies_dir(), Path)
-path = partial(click.option, type=UTF8_PATH_TYPE)
+path_option = partial(click.option, type=UTF8_PATH_TYPE)
 
 
 HELP_SETTINGS = dict(help_option_names=["-h", "--help"], max_content_width=100, show_default=True)
@@ -115,10 +115,10 @@ class FiniteNumber(click.FloatRange):
         if isinstance(number, float) and not math.isfinite(number):
             self.fail(f"{value} is not a finite number", param, ctx)
         if not low <= number <= high:
-            text = f"{short_text(number)} is outside {short_text(low)} to {short_text(high)}"
-            self.fail(text, param, ctx)
+            limits = f"{shorten_value(low)} to {shorten_value(high)}"
+            self.fail(f"{shorten_value(number)} is outside {limits}", param, ctx)
         if self.min_open and number == low:
-            self.fail(f"{short_text(number)} is not above {short_text(low)}", param, ctx)
+            self.fail(f"{shorten_value(number)} is not above {shorten_value(low)}", param, ctx)
         return number
 
 
@@ -128,17 +128,17 @@ class IntegerInRange(click.IntRange):
     name, _type_without_range, convert = "integer", click.INT, FiniteNumber.convert
 
 
-def number(
+def float_option(
     *names: str, limits: tuple[float, float], min_open: bool = False, **settings: Any
 ) -> Any:
     return click.option(*names, type=FiniteNumber(*limits, min_open=min_open), **settings)
 
 
-def integer(name: str, limits: tuple[int, int], **settings: Any) -> Any:
+def int_option(name: str, limits: tuple[int, int], **settings: Any) -> Any:
     return click.option(name, type=IntegerInRange(*limits), **settings)
 
 
-def choice(name: str, words: list[str], default: str) -> Any:
+def choice_option(name: str, words: list[str], default: str) -> Any:
     return click.option(name, type=click.Choice(words), default=default)
 
 
@@ -167,8 +167,8 @@ class CommaSeparated(click.ParamType):
         return tuple(self._item.convert(part.strip(), param, ctx) for part in value.split(","))
 
 
-NAMES_TYPE = CommaSeparated("NAME", click.STRING)
-POSITIVE_NUMBERS_TYPE = CommaSeparated("number", POSITIVE_TYPE)
+NAME_LIST_TYPE = CommaSeparated("NAME", click.STRING)
+POSITIVE_NUMBER_LIST_TYPE = CommaSeparated("number", POSITIVE_TYPE)
 
 
 class RegisteredName(click.Choice):
@@ -188,12 +188,12 @@ class RegisteredName(click.Choice):
     def choices(self, value: tuple[str, ...]) -> None: ...
 
 
-def output_folder(command: str) -> Callable[[Any], Any]:
+def output_folder(command_name: str) -> Callable[[Any], Any]:
     """Return a decorator for `--out DIR`; new folders that remain empty are removed at the end."""
     return click.option(
         "--out",
         type=UTF8_PATH_TYPE,
-        default=Path("out") / command,
+        default=Path("out") / command_name,
         metavar="DIR",
         callback=_schedule_empty_folder_removal,
     )
@@ -217,31 +217,33 @@ def _remove_empty_folders(new_folders: list[Path]) -> None:
             return
 
 
-jobs = click.option(
+jobs_option = click.option(
     "--jobs", type=IntegerInRange(1, 4096), callback=lambda _ctx, _param, count: count or -1
 )
-seed = partial(click.option, "--seed", type=IntegerInRange(0, 2**32 - 1))
-seed_with_default_0 = seed(default=0, help="Random seed.")
-dask_cluster = click.option("--cluster", metavar="ADDRESS")
-quiet = click.option("--quiet", is_flag=True)
-cutoff_hz = click.option("--cutoff", "cutoff_hz", type=POSITIVE_TYPE, default=30.0, metavar="HZ")
-rate_hz = partial(click.option, "--rate", "rate_hz", type=POSITIVE_TYPE, metavar="HZ")
-sensor_range = click.option("--range", "sensor_range", type=POSITIVE_TYPE, nargs=2, metavar="N NM")
-delay = click.option("--delay", type=DelayOrAuto(), default="auto")
-sigma = click.option("--sigma", type=SCALE_TYPE, default=0.0)
-gamma = click.option("--gamma", type=SCALE_TYPE, default=1.0)
-load_file = partial(path, "--load")
-gripper_file = path("--gripper")
-free_motion_log = path("--free", metavar="LOG")
-package_paths = path("--package-path", "package_paths", multiple=True, metavar="DIR")
-sensor_frame = partial(click.option, "--sensor-frame", metavar="NAME")
-sensor_pose = click.option(
+seed_option = partial(click.option, "--seed", type=IntegerInRange(0, 2**32 - 1))
+seed_with_default_0_option = seed_option(default=0, help="Random seed.")
+dask_cluster_option = click.option("--cluster", metavar="ADDRESS")
+quiet_option = click.option("--quiet", is_flag=True)
+cutoff_option = click.option(
+    "--cutoff", "cutoff_hz", type=POSITIVE_TYPE, default=30.0, metavar="HZ"
+)
+rate_option = partial(click.option, "--rate", "rate_hz", type=POSITIVE_TYPE, metavar="HZ")
+range_option = click.option("--range", "sensor_range", type=POSITIVE_TYPE, nargs=2, metavar="N NM")
+delay_option = click.option("--delay", type=DelayOrAuto(), default="auto")
+sigma_option = click.option("--sigma", type=SCALE_TYPE, default=0.0)
+gamma_option = click.option("--gamma", type=SCALE_TYPE, default=1.0)
+load_file_option = partial(path_option, "--load")
+gripper_file_option = path_option("--gripper")
+free_motion_log_option = path_option("--free", metavar="LOG")
+package_path_option = path_option("--package-path", "package_paths", multiple=True, metavar="DIR")
+sensor_frame_option = partial(click.option, "--sensor-frame", metavar="NAME")
+sensor_pose_option = click.option(
     "--sensor-pose", nargs=6, type=FiniteNumber(-1e3, 1e3), metavar="X Y Z ROLL PITCH YAW"
 )
 
 
 def refuse_given_options(*names: str, remedy: str) -> None:
-    """Raise DrakeTeleopError if the user gave one of these options: it would have no effect."""
+    """Raise DrakeTeleopError if the user gave one of these options, which have no effect here."""
     context = click.get_current_context()
     for parameter in context.command.params:
         source = context.get_parameter_source(str(parameter.name))
@@ -262,12 +264,12 @@ def confirm_at_terminal(question: str) -> bool:
     return sys.stdin.isatty() and click.confirm(question, err=True)
 
 
-skip_run_count_question = click.option(
+skip_run_count_question_option = click.option(
     "--yes", is_flag=True, callback=lambda _ctx, _param, is_set: is_set or confirm_at_terminal
 )
 
 
-def sigma_weight_and_sigma_inertia(command: Any) -> Any:
+def sigma_weight_and_inertia_options(command: Any) -> Any:
     for part in ("inertia", "weight"):
         command = click.option(f"--sigma-{part}", type=SCALE_TYPE)(command)
     return command
@@ -289,14 +291,14 @@ def stream_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
     decorated: Callable[..., Any] = call_with_arm
     for option in (
-        delay,
-        cutoff_hz,
+        delay_option,
+        cutoff_option,
         click.option("--real-time", is_flag=True),
-        sensor_range,
-        sensor_pose,
-        package_paths,
-        sensor_frame(),
-        path("--model"),
+        range_option,
+        sensor_pose_option,
+        package_path_option,
+        sensor_frame_option(),
+        path_option("--model"),
         click.option("--motion", metavar="SOURCE"),
     ):
         decorated = option(decorated)

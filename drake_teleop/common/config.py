@@ -37,10 +37,10 @@ def quantity(
     metadata = {"unit": unit, "low": low, "high": high, "doc": doc, "length": length}
     if isinstance(default, list) and default:
         metadata["length"] = len(default)
-    return _field_with_default(default, metadata)
+    return _make_field_with_default(default, metadata)
 
 
-def _field_with_default(default: Any, metadata: dict[str, Any]) -> Any:
+def _make_field_with_default(default: Any, metadata: dict[str, Any]) -> Any:
     if isinstance(default, (list, dict)):
         return dataclasses.field(default_factory=lambda: type(default)(default), metadata=metadata)
     return dataclasses.field(default=default, metadata=metadata)
@@ -57,17 +57,17 @@ def choice(
 def plain(
     default: Any, doc: str, registry: Registry[Any] | None = None, *, is_path: bool = False
 ) -> Any:
-    """Return a dataclass field for a flag, word, integer, list or mapping of names.
+    """Return a dataclass field without unit or choices: flag, word, integer, list or mapping.
 
     With `is_path` the texts are paths, which `with_absolute_paths` resolves.
     """
-    return _field_with_default(default, {"doc": doc, "registry": registry, "is_path": is_path})
+    return _make_field_with_default(default, {"doc": doc, "registry": registry, "is_path": is_path})
 
 
 def with_absolute_paths(config: Any, folder: Path) -> Any:
     """Return a copy of a dataclass whose paths, relative to `folder`, are absolute, at any depth.
 
-    A path that equals the field's default is a shipped model: it remains unless it is in `folder`.
+    A default path is a shipped model; it changes only if `folder` contains such a file.
     """
 
     def resolve_paths(value: Any, entry: dataclasses.Field[Any]) -> Any:
@@ -88,7 +88,7 @@ def with_absolute_paths(config: Any, folder: Path) -> Any:
     return dataclasses.replace(config, **changes) if changes else config
 
 
-def short_text(value: Any) -> str:
+def shorten_value(value: Any) -> str:
     if value is None:
         return "nothing"
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
@@ -103,7 +103,7 @@ def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False
     `tagged` allows the key "_tag" with a YAML tag.
     """
     if not isinstance(data, dict):
-        what = f"expected a mapping of fields, found {short_text(data)}"
+        what = f"expected a mapping of fields, found {shorten_value(data)}"
         remedy = f"the fields are {', '.join(_field_names(schema))}"
         raise DrakeTeleopError(what, where=where, remedy=remedy)
     if "_tag" in data and not tagged:
@@ -130,9 +130,9 @@ def check_field(schema: type, name: str, value: Any, where: str) -> None:
     check_field_name(schema, name, where)
     entry = schema.__dataclass_fields__[name]  # type: ignore[attr-defined]
     if not entry.init and value != entry.default:
-        what = f"{short_text(value)} has no effect in Python (only in files)"
+        what = f"{shorten_value(value)} has no effect in Python (only in files)"
         raise DrakeTeleopError(what, where=where, remedy=entry.metadata["in_python"])
-    _check_field_value(entry, _type_of_field(entry, _type_hints(schema)[name]), value, where)
+    _check_field_value(entry, _read_field_type(entry, _type_hints(schema)[name]), value, where)
 
 
 def check_all_field_values(config: Any, where: str) -> None:
@@ -141,12 +141,12 @@ def check_all_field_values(config: Any, where: str) -> None:
     for field in dataclasses.fields(config):
         value, place = getattr(config, field.name), field_location(where, field.name)
         _check_field_value(field, kinds[field.name], value, place)
-        for item_place, item in _locations_and_list_items(value, place):
+        for item_place, item in _locate_list_items(value, place):
             if dataclasses.is_dataclass(item):
                 check_all_field_values(item, item_place)
 
 
-def _locations_and_list_items(value: Any, where: str) -> list[tuple[str, Any]]:
+def _locate_list_items(value: Any, where: str) -> list[tuple[str, Any]]:
     if isinstance(value, list):
         return [(f"{where}[{index}]", item) for index, item in enumerate(value)]
     return [(where, value)]
@@ -180,15 +180,15 @@ def _check_quantity_range(metadata: Any, value: Any, where: str) -> None:
     unit = "" if metadata["unit"] == "1" else f" {metadata['unit']}"
     for number in values:
         if not low <= number <= high:  # also false for NaN
-            limits = f"{short_text(low)} to {short_text(high)}{unit}"
-            what = f"{short_text(number)}{unit} is outside {limits}"
+            limits = f"{shorten_value(low)} to {shorten_value(high)}{unit}"
+            what = f"{shorten_value(number)}{unit} is outside {limits}"
             remedy = f"check the value and its unit ({metadata['doc']})"
             raise DrakeTeleopError(what, where=where, remedy=remedy)
 
 
 def _field_types(schema: type) -> dict[str, FieldType]:
     hints, entries = _type_hints(schema), dataclasses.fields(schema)
-    return {entry.name: _type_of_field(entry, hints[entry.name]) for entry in entries}
+    return {entry.name: _read_field_type(entry, hints[entry.name]) for entry in entries}
 
 
 @functools.cache
@@ -196,8 +196,8 @@ def _type_hints(schema: type) -> dict[str, Any]:
     return typing.get_type_hints(schema)
 
 
-def _type_of_field(entry: dataclasses.Field[Any], hint: Any) -> FieldType:
-    registry, kind = entry.metadata.get("registry"), field_type_of(hint)
+def _read_field_type(entry: dataclasses.Field[Any], hint: Any) -> FieldType:
+    registry, kind = entry.metadata.get("registry"), parse_type_hint(hint)
     if registry is None or "choices" in entry.metadata:
         return kind
     return kind._replace(items=tuple(registry.values()))
@@ -208,7 +208,7 @@ def _field_names(schema: type) -> list[str]:
 
 
 class FieldType(NamedTuple):
-    """Structure of a field's type: `list[A | B] | None` is (1, (A, B), True).
+    """Structure of a type: for `list[A | B] | None`, depth 1, items A and B, optional True.
 
     `is_mapping` is True for `dict[str, A]`, a mapping of names to items.
     """
@@ -220,16 +220,16 @@ class FieldType(NamedTuple):
 
 
 @functools.cache
-def field_type_of(hint: Any) -> FieldType:
+def parse_type_hint(hint: Any) -> FieldType:
     if typing.get_origin(hint) is list:
-        inner = field_type_of(typing.get_args(hint)[0])
+        inner = parse_type_hint(typing.get_args(hint)[0])
         return FieldType(inner.list_depth + 1, inner.items, False)
     if typing.get_origin(hint) is dict:
-        return FieldType(0, field_type_of(typing.get_args(hint)[1]).items, False, is_mapping=True)
+        return FieldType(0, parse_type_hint(typing.get_args(hint)[1]).items, False, is_mapping=True)
     if typing.get_origin(hint) not in (typing.Union, types.UnionType):
         return FieldType(0, (hint,), False)
     options = tuple(option for option in typing.get_args(hint) if option is not type(None))
-    inner = field_type_of(options[0]) if len(options) == 1 else FieldType(0, options, False)
+    inner = parse_type_hint(options[0]) if len(options) == 1 else FieldType(0, options, False)
     return inner._replace(optional=len(options) < len(typing.get_args(hint)))
 
 
@@ -294,7 +294,7 @@ def _make_type_error(expected: str, found: Any, where: str, remedy: str = "") ->
     return DrakeTeleopError(f"expected {expected}, found {shown}", where=where, remedy=remedy)
 
 
-_Class = TypeVar("_Class", bound=type)
+_DataclassT = TypeVar("_DataclassT", bound=type)
 
 
 @dataclass(frozen=True)
@@ -303,7 +303,7 @@ class FieldInfo:
 
     Attributes:
         kind: "number", "whole number", "true or false", "word" or "block" (a dataclass); for a
-            list or mapping, that of its items.
+            list or mapping, the kind of its items.
         list_depth: number of nested lists, 0 for one value.
         is_mapping: True if the value maps names to items.
         unit: "1" for a dimensionless quantity; empty if the field is no quantity.
@@ -343,10 +343,10 @@ class FieldInfo:
         return f"{self.name}: {self.meaning}" + (f" ({'; '.join(metadata)})" if metadata else "")
 
 
-def settings(block: _Class) -> _Class:
+def settings(block: _DataclassT) -> _DataclassT:
     """Decorate a dataclass: check values at assignment, and list the fields in its docstring.
 
-    Its module must not import `annotations` from `__future__`: Drake reads the fields' types.
+    The dataclass's module must not import `annotations` from `__future__`: Drake reads the types.
     """
     block.__setattr__ = _set_checked_attribute  # type: ignore[assignment]
     block.__str__ = _describe_non_default_fields  # type: ignore[assignment]
@@ -365,7 +365,7 @@ def _lines_of_non_default_fields(config: Any) -> Iterator[str]:
         value = getattr(config, entry.name)
         if value == _default_value(entry):
             continue
-        blocks = _locations_and_list_items(value, entry.name)
+        blocks = _locate_list_items(value, entry.name)
         if not blocks or not dataclasses.is_dataclass(blocks[0][1]):
             yield f"{entry.name}: {_format_value(value)}"
             continue
@@ -396,11 +396,11 @@ def unchecked_assignments() -> Iterator[None]:
 
 
 def fields_of(config: Any) -> list[FieldInfo]:
-    return [_field_info(entry, config) for entry in dataclasses.fields(config)]
+    return [_describe_field(entry, config) for entry in dataclasses.fields(config)]
 
 
-def _field_info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
-    lists, items, optional, is_mapping = _type_of_field(entry, entry.type)
+def _describe_field(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
+    lists, items, optional, is_mapping = _read_field_type(entry, entry.type)
     blocks = tuple(item for item in items if item not in TYPE_NAMES)
     metadata = entry.metadata
     choices = *metadata.get("choices", ()), *(metadata.get("registry") or ())

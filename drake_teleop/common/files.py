@@ -80,7 +80,7 @@ def write_picture(path: Path, figure: Figure, **options: Any) -> None:
 def write_table(
     path: Path, table: pl.DataFrame, *, temporary_base: Path | None = None, **options: Any
 ) -> None:
-    """Write a table as CSV if `path` ends with .csv, else as Parquet; polars gets `options`."""
+    """Write a table as CSV if `path` ends with .csv, else Parquet, with `options` of polars."""
     import polars as pl
 
     refuse_polars_in_forked_process()
@@ -98,7 +98,7 @@ def output_folder(
 ) -> Iterator[None]:
     """Create `out` and remove its `completion_file`, which this context then writes last.
 
-    A CannotWrite error lists the new files, and earlier ones in `valid_after_failure`.
+    A CannotWrite error lists the valid files: new ones, and those in `valid_after_failure`.
     """
     make_folder(out)
     with wrap_write_errors(out / completion_file):

@@ -64,10 +64,7 @@ def as_compiled_arguments(values: _Record) -> _Record:
 
 
 def pack_for_compiled_code(**values: ArrayLike) -> Records:
-    """Return a structured array (1,) with these values as float64 fields.
-
-    Compiled code takes it faster than a named tuple.
-    """
+    """Return values as float64 fields of a record array (1,), fast to pass to compiled code."""
     arrays = {name: np.asarray(value, float) for name, value in values.items()}
     fields = [(name, float, array.shape) for name, array in arrays.items()]
     packed: Records = np.zeros(1, np.dtype((np.record, fields)))
@@ -136,10 +133,7 @@ def nonnegative_array(name: str, value: ArrayLike, *shape: int) -> Array:
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Limit BLAS to one thread, in a context or, as decorator, in a function.
-
-    Several threads change the last digits of sums.
-    """
+    """Limit BLAS to one thread, in a context or a decorated function, for reproducible sums."""
     import scipy.linalg  # noqa: F401 (a BLAS that is loaded later is not limited)
     from threadpoolctl import threadpool_limits
 

@@ -43,18 +43,18 @@ def _check_footer_and_columns(content: bytes | mmap.mmap) -> None:
     start = end - int.from_bytes(content[end : end + 4], "little")
     _require(start >= len(_PARQUET_MAGIC), "its footer is longer than the file")
     footer = _ThriftReader(content[start:end]).read_struct()
-    columns = list(_column_names_and_is_unrepeated(footer[2]))
+    columns = list(_read_column_names_and_flatness(footer[2]))
     groups = footer.get(4, [])
     rows = [_read_size(group, 3, "rows in a row group") for group in groups]
     same_rows = _read_size(footer, 3, "rows") == sum(rows)
-    _require(same_rows, "its row groups have other numbers of rows than the file")
+    _require(same_rows, "the rows of its row groups do not add up to its number of rows")
     for group, count in zip(groups, rows, strict=True):
         _require(len(group[1]) == len(columns), "a row group and the schema have different columns")
         for chunk, (name, is_flat) in zip(group[1], columns, strict=True):
             _check_column_chunk(content, start, chunk[3], name, count if is_flat else None)
 
 
-def _column_names_and_is_unrepeated(schema: list[_ThriftStruct]) -> Iterator[tuple[str, bool]]:
+def _read_column_names_and_flatness(schema: list[_ThriftStruct]) -> Iterator[tuple[str, bool]]:
     above = [(len(schema), True)]  # of each enclosing group: remaining children, is flat
     for element in schema:
         while above[-1][0] == 0:
@@ -106,7 +106,7 @@ def _count_values_of_page(page: _ThriftStruct, length: int, where: str) -> int:
         size = _read_size(header, number, f"{name} in {where}")
         _require(size <= values, f"{where} has more {name} than values")
     levels = sum(_read_size(header, number, f"bytes in {where}") for number in (5, 6))
-    _require(levels <= length, f"{where} is shorter than its levels")
+    _require(levels <= length, f"{where} is shorter than the level data in it")
     return values
 
 
@@ -157,7 +157,7 @@ class _ThriftReader:
 
     def _read_bytes(self, size: int) -> bytes:
         at, self.at = self.at, self.at + size
-        _require(self.at <= len(self._content), "its metadata goes beyond its end")
+        _require(self.at <= len(self._content), "a value of its metadata is cut off")
         return bytes(self._content[at : self.at])
 
     def _read_byte(self) -> int:

@@ -12,7 +12,7 @@ UpdateProgress: TypeAlias = Callable[..., None]
 """Function that displays a completed fraction, 0 to 1, and an optional status text."""
 StartStage: TypeAlias = Callable[[str], UpdateProgress]
 """Function that begins a stage of work by its name, and returns its `UpdateProgress`."""
-_TIME_BETWEEN_LINES_S = 15.0
+_PROGRESS_LINE_PERIOD_S = 15.0
 
 
 def show_no_progress(name: str) -> UpdateProgress:
@@ -47,7 +47,7 @@ def _show_stages_as_lines(delay_s: float) -> StartStage:
             if (now := time.monotonic()) >= next_line:
                 text = text or f"{words} {fraction:.0%}".strip()
                 print(f"{name} {text}", file=sys.stderr, flush=True)
-                next_line, text = now + _TIME_BETWEEN_LINES_S, ""
+                next_line, text = now + _PROGRESS_LINE_PERIOD_S, ""
 
         update(0.0)
         return update

@@ -60,13 +60,13 @@ class _YamlDumper(yaml.SafeDumper):
     def represent_text(self, text: str) -> Any:
         return self.represent_scalar(f"{_TAG_PREFIX}str", text, None if text.isprintable() else '"')
 
-    def represent_fields(self, data: dict[str, Any]) -> Any:
+    def represent_tagged_mapping(self, data: dict[str, Any]) -> Any:
         tag = data.get("_tag", f"{_TAG_PREFIX}map")
         return self.represent_mapping(tag, [item for item in data.items() if item[0] != "_tag"])
 
 
 _YamlDumper.add_representer(str, _YamlDumper.represent_text)
-_YamlDumper.add_representer(dict, _YamlDumper.represent_fields)
+_YamlDumper.add_representer(dict, _YamlDumper.represent_tagged_mapping)
 _SCALAR_PATTERNS = {kind: re.compile(rf"(?:{pattern})\Z") for kind, pattern, _ in _YAML_CORE_SCHEMA}
 for _kind, _, _first in _YAML_CORE_SCHEMA:
     for _side in (_YamlLoader, _YamlDumper):

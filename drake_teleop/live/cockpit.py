@@ -19,9 +19,9 @@ from drake_teleop.station.slave.inverse_kinematics import IkStatus
 
 #: Contact force at the slave that the page shows as contact [N]; noise and motion remain below.
 MIN_CONTACT_FORCE_N = 2.0
-_WARNING_LIMIT_SHARE = 0.999
-_WARNING_HAND_FORCE_N = 59.0  # N; the limit of a hand is 60 N
-_WARNING_PACKET_SILENCE_S = 0.05  # s
+_LIMIT_SHARE_FOR_WARNING = 0.999
+_HAND_FORCE_FOR_WARNING_N = 59.0  # N; the limit of a hand is 60 N
+_PACKET_SILENCE_FOR_WARNING_S = 0.05  # s
 
 
 @njit(cache=True)
@@ -66,8 +66,8 @@ class PageValueCalculator:
         arm = slave_arm(scenario)
         self._table, n = arm.table, arm.num_joints
         self._limits = (
-            ("speed", "slave_state", slice(n, None), _WARNING_LIMIT_SHARE * arm.velocity_limit),
-            ("torque", "joint_torque", slice(None), _WARNING_LIMIT_SHARE * arm.effort_limit),
+            ("speed", "slave_state", slice(n, None), _LIMIT_SHARE_FOR_WARNING * arm.velocity_limit),
+            ("torque", "joint_torque", slice(None), _LIMIT_SHARE_FOR_WARNING * arm.effort_limit),
         )
         self._peak_force = scenario.master.device(0.0, 0.0).parameters.peak_force
         self._energy = np.zeros(2)
@@ -109,18 +109,18 @@ class PageValueCalculator:
             yield "the arm cannot reach the position of the hand"
         if rows["saturated"].max() > 0:
             yield "the wrist sensor is saturated"
-        if self._forces[2, 1] >= _WARNING_LIMIT_SHARE * self._peak_force:
+        if self._forces[2, 1] >= _LIMIT_SHARE_FOR_WARNING * self._peak_force:
             yield f"the device renders its largest force, {self._peak_force:g} N"
         hand = np.empty(2)
         norm_range_into(rows["hand_wrench_E"], zeros, hand)
-        if hand[1] > _WARNING_HAND_FORCE_N:
+        if hand[1] > _HAND_FORCE_FOR_WARNING_N:
             yield "the simulated hand pulls with its largest force"
         for quantity, name, part, limits in self._limits:
             at_limit = (np.abs(rows[name][:, part]) >= limits).any(axis=0)
             if at_limit.any():
                 joints = [str(k + 1) for k in np.flatnonzero(at_limit)]
                 yield f"joint {', '.join(joints)} at the limit of its {quantity}"
-        if "ports" in rows and rows["ports"][:, 4:6].max() > _WARNING_PACKET_SILENCE_S:
+        if "ports" in rows and rows["ports"][:, 4:6].max() > _PACKET_SILENCE_FOR_WARNING_S:
             yield "the network delivers no packets"
         if any(abs(getattr(inputs, name)) == INPUT_RANGES[name][1] for name in ("x", "y", "z")):
             yield "the hand is at the edge of its box, 0.3 m wide"

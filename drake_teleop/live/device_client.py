@@ -55,7 +55,7 @@ class HapticDevice(Protocol):
 class DeviceClient:
     """Connection of a haptic device to a station.
 
-    `force_ages_s`: age [s] of the position that each displayed force answers.
+    `force_ages_s`: for each displayed force, the age [s] of the position that caused it.
     """
 
     def __init__(self, device: HapticDevice, address: str, *, observe: bool = True) -> None:
@@ -106,10 +106,10 @@ class DeviceClient:
 
     def _send_state(self, pose: device_packets.DeviceState, now: float, force_age: float) -> None:
         self._number += 1
-        behind = force_age if force_age < 1.0 else 0.0
-        if behind:
-            self.force_ages_s.append(behind)
-        state = pose._replace(number=self._number, t=now, behind=behind)
+        force_age_s = force_age if force_age < 1.0 else 0.0
+        if force_age_s:
+            self.force_ages_s.append(force_age_s)
+        state = pose._replace(number=self._number, t=now, force_age_s=force_age_s)
         try:
             self._socket.send(device_packets.pack_state(state))
         except (BlockingIOError, ConnectionError):  # the next one is newer
@@ -121,7 +121,7 @@ class DeviceClient:
 
 
 class VirtualDevice:
-    """Simulated device in a moving hand; `energy`: its work against the rendered force [J]."""
+    """Simulated device in a moving hand; `energy`: work done against the rendered force [J]."""
 
     def __init__(self, hand_motion: HandMotion, grip: str = "medium") -> None:
         held, self._hand = GRIP_IMPEDANCES[grip], hand_motion
@@ -234,7 +234,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "behind_p99_ms": float(1e3 * np.percentile(behind, 99)),
         "largest_force_n": largest,
         "energy_j": client.guard.energy,
-        "slowed": client.guard.slowed,
+        "slowed": client.guard.num_reduced_forces,
     }
     if options.json is not None:
         write_json(options.json, figures)

@@ -18,7 +18,7 @@ from drake_teleop.common.numeric import Array
 
 COMMAND_TIMEOUT_S = 0.05  #: age of a command at which the force is zero [s]
 _FORCE_FADE_START_AGE_S = 0.02  # s
-_LIMIT_RAMP_UP_N_S = 100.0  # N/s, of the force limit after silence
+_LIMIT_RISE_N_S = 100.0  # N/s, slew rate of the force limit after silence
 _MAX_STORED_ENERGY_J, _STORED_ENERGY_KEPT_J = 0.3, 3e-5  # J
 _MAX_DAMPING_NS_M = 100.0  # N s/m
 
@@ -38,11 +38,11 @@ class DeviceGuard:
 
     Attributes:
         energy: energy from the hand into the device since the start [J].
-        slowed: number of forces that the observer has reduced.
+        num_reduced_forces: number of forces that the observer has reduced.
     """
 
     def __init__(self, limits: DeviceLimits, *, observe: bool = True) -> None:
-        self.energy, self.slowed = 0.0, 0
+        self.energy, self.num_reduced_forces = 0.0, 0
         self._limits, self._observe = limits, observe
         self._stored_energy, self._force_limit, self._was_silent = 0.0, limits.force, True
         self._force, self._torque, self._velocity = np.zeros((3, 3))
@@ -62,7 +62,7 @@ class DeviceGuard:
         next_motion = period * (2.0 * velocity - self._velocity)
         self._position, self._velocity = x, velocity
 
-        share = self._update_force_limit_and_find_fade(age, period)
+        share = self._update_limit_and_get_fade_factor(age, period)
         force, torque = _zeros_if_any_not_finite(wrench[:3]), _zeros_if_any_not_finite(wrench[3:])
         limits = self._limits
         force = _limit_norm(share * force, min(limits.force, self._force_limit))
@@ -81,12 +81,12 @@ class DeviceGuard:
         self._force, self._torque, self._velocity = np.zeros((3, 3))
         self._position = None
 
-    def _update_force_limit_and_find_fade(self, age: float, period: float) -> float:
+    def _update_limit_and_get_fade_factor(self, age: float, period: float) -> float:
         if not age < COMMAND_TIMEOUT_S:
             self._was_silent = True
         elif self._was_silent:
             self._was_silent, self._force_limit = False, 0.0
-        self._force_limit = min(self._force_limit + _LIMIT_RAMP_UP_N_S * period, self._limits.force)
+        self._force_limit = min(self._force_limit + _LIMIT_RISE_N_S * period, self._limits.force)
         share = (COMMAND_TIMEOUT_S - age) / (COMMAND_TIMEOUT_S - _FORCE_FADE_START_AGE_S)
         return min(max(share, 0.0), 1.0) if age < COMMAND_TIMEOUT_S else 0.0
 
@@ -95,7 +95,7 @@ class DeviceGuard:
         returned = float(force @ next_motion)
         if returned <= available or distance < 1e-12 or not force.any():
             return force
-        self.slowed += 1
+        self.num_reduced_forces += 1
         force_along = returned / distance
         max_force = max(available / distance, -_MAX_DAMPING_NS_M * math.hypot(*self._velocity))
         return force - max(force_along - max_force, 0.0) / distance * next_motion

@@ -24,7 +24,7 @@ _CLIENT_EXIT_TIMEOUT_S = 2.0  # s
 _MAX_PACKETS_PER_POLL = 256  # packets per poll
 _NUM_PACKETS_OF_LINK_STATISTICS = 2000  # packets in the statistics of lateness
 # Duration of the open clutch after silence, while the hand moves to the device's pose [s].
-_CLUTCH_OPEN_AT_CONNECT_S = 0.05
+_OPEN_CLUTCH_TIME_S = 0.05
 
 
 class DeviceLink:
@@ -95,7 +95,7 @@ class DeviceLink:
         self._state, self._last_arrival = state, now
         self._origin = self._origin or state
         self._latencies.append(now - state.t)
-        self._force_ages.append(state.behind)
+        self._force_ages.append(state.force_age_s)
 
     def is_device_silent(self, now: float) -> bool:
         return now - self._last_arrival > COMMAND_TIMEOUT_S
@@ -123,12 +123,12 @@ class DeviceLink:
         moved = np.subtract(state.position, first.position)
         back = conjugate_quaternion(first.quaternion_wxyz)
         values = inputs_at_displacement(moved, quaternion_product(state.quaternion_wxyz, back))
-        if state.flags & CLUTCH_OPEN_FLAG or now - self._connected_at < _CLUTCH_OPEN_AT_CONNECT_S:
+        if state.flags & CLUTCH_OPEN_FLAG or now - self._connected_at < _OPEN_CLUTCH_TIME_S:
             values["clutch"] = 0
         return values
 
     def link_statistics(self) -> dict[str, float]:
-        """Return lost packets, percentiles of lateness and age of forces [ms]."""
+        """Return number of lost packets, percentiles of packet lateness and force age [ms]."""
         late = np.array(self._latencies or [0.0])
         behind = np.array(self._force_ages or [0.0])
         return {

@@ -1,7 +1,7 @@
 """Packets between a haptic device and the station: little-endian, in the device's base frame B.
 
 From the device: "DTD1", flags, number, time [s], position (3) [m], orientation (4) [w, x, y, z],
-age of the position that the displayed force answers [s]. To the device: "DTF1", 0, number and time
+age of the position that caused the displayed force [s]. To the device: "DTF1", 0, number and time
 of the answered packet, wrench (6) [N, N m].
 """
 
@@ -26,7 +26,7 @@ class DeviceState(NamedTuple):
         position: p_BE [m].
         quaternion_wxyz: (4,) unit quaternion of R_BE.
         flags: 0 or `CLUTCH_OPEN_FLAG`.
-        behind: age of the position that the displayed force answers [s]; 0: no force.
+        force_age_s: age of the position that caused the displayed force [s]; 0: no force.
     """
 
     number: int
@@ -34,7 +34,7 @@ class DeviceState(NamedTuple):
     position: tuple[float, float, float]
     quaternion_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     flags: int = 0
-    behind: float = 0.0
+    force_age_s: float = 0.0
 
 
 class ForceCommand(NamedTuple):
@@ -46,7 +46,7 @@ class ForceCommand(NamedTuple):
 
 
 def pack_state(state: DeviceState) -> bytes:
-    numbers = (*state.position, *state.quaternion_wxyz, state.behind)
+    numbers = (*state.position, *state.quaternion_wxyz, state.force_age_s)
     return _STATE_FORMAT.pack(_STATE_TAG, state.flags, state.number, state.t, *numbers)
 
 
@@ -61,21 +61,21 @@ def unpack_state(packet: bytes) -> DeviceState | None:
 def valid_state(number: int, t: float, flags: int, numbers: Sequence[float]) -> DeviceState | None:
     """Return the state with a unit quaternion; None if position, orientation or a time is invalid.
 
-    `numbers` (8,) are position, quaternion and `behind`, which is clipped to 1 s.
+    `numbers` (8,) are position, quaternion and `force_age_s`, which is clipped to 1 s.
     """
-    x, y, z, w, i, j, k, behind = numbers
+    x, y, z, w, i, j, k, force_age_s = numbers
     length = math.sqrt(w * w + i * i + j * j + k * k)
     # Comparisons with nan are False, so that nan is refused, too.
     if not (
         all(abs(p) <= _MAX_POSITION_M for p in (x, y, z))
         and 0.5 < length < 2.0
         and -1e12 <= t <= 1e12
-        and math.isfinite(behind)
+        and math.isfinite(force_age_s)
     ):
         return None
     orientation = (w / length, i / length, j / length, k / length)
-    behind = min(max(behind, 0.0), 1.0)
-    return DeviceState(number, t, (x, y, z), orientation, flags & CLUTCH_OPEN_FLAG, behind)
+    force_age_s = min(max(force_age_s, 0.0), 1.0)
+    return DeviceState(number, t, (x, y, z), orientation, flags & CLUTCH_OPEN_FLAG, force_age_s)
 
 
 def rejection_reason(packet: bytes) -> str:

@@ -24,7 +24,7 @@ from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.sensor.presets import PRESETS as SENSOR_PRESETS
 
 AS_IN_SCENARIO_NAME = "as in the scenario"
-NETWORKS = (AS_IN_SCENARIO_NAME, *NETWORK_PRESETS, "custom")
+NETWORK_NAMES = (AS_IN_SCENARIO_NAME, *NETWORK_PRESETS, "custom")
 SENSOR_NAMES = (AS_IN_SCENARIO_NAME, *SENSOR_PRESETS)
 
 #: Length of a slice [ms]; inputs change between slices.
@@ -35,8 +35,8 @@ MAX_DURATION_MS = 36_000_000  # ms; ten hours, as for a scenario
 
 
 def choice_names() -> dict[str, tuple[str, ...]]:
-    """Return by name the options that network, grip, sensor and method of `Inputs` index."""
-    shipped = {"network": NETWORKS, "grip": tuple(GRIP_IMPEDANCES), "sensor": SENSOR_NAMES}
+    """Return the names of all networks, grips, sensors and methods, in the order of `Inputs`."""
+    shipped = {"network": NETWORK_NAMES, "grip": tuple(GRIP_IMPEDANCES), "sensor": SENSOR_NAMES}
     return shipped | {"method": tuple(METHODS)}
 
 
@@ -58,7 +58,7 @@ def _integer_field_with_range(default: int, low: int, high: int) -> Any:
 
 @dataclass(frozen=True)
 class Inputs:
-    """Inputs that the driver (the page that moves the hand) may change; integers.
+    """Inputs, all integers, that the driver (the page that moves the hand) may change.
 
     Attributes:
         x, y, z: intended displacement of the stylus in B [10 um].
@@ -89,7 +89,7 @@ class Inputs:
     sigma_object: int = _integer_field_with_range(0, 0, 300)
     gamma: int = _integer_field_with_range(100, 0, 300)
     force_scale: int = _integer_field_with_range(5714, 0, 100_000)
-    network: int = _integer_field_with_range(0, 0, len(NETWORKS) - 1)
+    network: int = _integer_field_with_range(0, 0, len(NETWORK_NAMES) - 1)
     delay: int = _integer_field_with_range(500, 0, 20_000)
     jitter: int = _integer_field_with_range(20, 0, 100)
     loss: int = _integer_field_with_range(0, 0, 500)
@@ -130,7 +130,8 @@ class Inputs:
     @property
     def station_choices(self) -> tuple[int, ...]:
         """Values of the inputs whose change requires a new station."""
-        line = (self.delay, self.jitter, self.loss) if NETWORKS[self.network] == "custom" else ()
+        is_custom = NETWORK_NAMES[self.network] == "custom"
+        line = (self.delay, self.jitter, self.loss) if is_custom else ()
         choices = (self.network, self.method, self.grip, self.object, self.detection, self.sensor)
         return (*choices, *line)
 
@@ -190,11 +191,11 @@ def inputs_at_displacement(
     return values
 
 
-_VERSION_BY_PACKAGE_NAME = {"drake_teleop": __version__}
+_CURRENT_VERSIONS = {"drake_teleop": __version__}
 
 
-def csv_header(made_by: Mapping[str, str] = _VERSION_BY_PACKAGE_NAME) -> str:
-    comment = ", ".join(f"{name} {version}" for name, version in made_by.items())
+def csv_header(versions: Mapping[str, str] = _CURRENT_VERSIONS) -> str:
+    comment = ", ".join(f"{name} {version}" for name, version in versions.items())
     return f"# {comment}\n{','.join(_CSV_COLUMNS)}\n"
 
 
@@ -204,26 +205,26 @@ def csv_row(ms: int, inputs: Inputs) -> str:
 
 
 def read_inputs(
-    path: Path, made_by: Mapping[str, str] = _VERSION_BY_PACKAGE_NAME
+    path: Path, versions: Mapping[str, str] = _CURRENT_VERSIONS
 ) -> list[tuple[int, Inputs]]:
-    """Return the recorded changes as (time [ms], inputs); the last is the end.
+    """Return the recorded changes as (time [ms], inputs); the time of the last one is the end.
 
-    Raise DrakeTeleopError if the file is invalid or not of the versions `made_by`.
+    Raise DrakeTeleopError if the file is invalid or was not written by these `versions`.
     """
     complete = read_text(path).rpartition("\n")[0]
     lines = [line.split(",") for line in complete.split("\n")]
     if tuple(lines[0]) == _CSV_COLUMNS:
-        raise _not_repeatable("does not contain the version of drake_teleop that wrote it", path)
+        raise _repeat_error("does not contain the version of drake_teleop that wrote it", path)
     if tuple(lines[1:2]) != (list(_CSV_COLUMNS),) or not complete.startswith("# "):
         what = "does not contain the inputs of a recorded live session"
         remedy = f"use the columns {', '.join(_CSV_COLUMNS)}"
         raise DrakeTeleopError(what, where=str(path), remedy=remedy)
     recorded = dict(re.findall(r"(\w+) ([^,\s]+)", complete.split("\n")[0]))
-    for name, value in made_by.items():
+    for name, value in versions.items():
         if recorded.get(name) != value:
             what = f"was recorded with {name} {recorded.get(name, 'unknown')}, not with {value}"
             changed = "the models or other files that its scenario names have changed"
-            raise _not_repeatable(changed if name == "files" else what, path)
+            raise _repeat_error(changed if name == "files" else what, path)
     changes = list(_parse_csv_rows(lines[2:], path))
     if not changes or changes[-1][0] == 0:
         remedy = "record the session again"
@@ -231,7 +232,7 @@ def read_inputs(
     return changes
 
 
-def _not_repeatable(what: str, path: Path) -> DrakeTeleopError:
+def _repeat_error(what: str, path: Path) -> DrakeTeleopError:
     folder = shlex.quote(str(path.parent))
     remedy = f"it cannot be repeated exactly; to see its log, run drake-teleop replay {folder}"
     return DrakeTeleopError(what, where=str(path), remedy=remedy)
@@ -248,7 +249,7 @@ def _parse_csv_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, I
             if line[column] in choices.get(name, ()):
                 line[column] = str(choices[name].index(line[column]))
             elif name in choices:
-                raise _not_repeatable(f"has the unknown {name} {line[column]!r}", path)
+                raise _repeat_error(f"has the unknown {name} {line[column]!r}", path)
         try:
             ms, *values = map(int, line)
         except ValueError:

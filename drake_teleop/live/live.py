@@ -187,7 +187,7 @@ class Live:
         self.requested_scene, self._refusal = "", why
         self.pace.restart(now)
 
-    def hello(self) -> dict[str, Any]:
+    def hello_message(self) -> dict[str, Any]:
         scaling = self._scenario.kinematic_scaling
         return {
             "scenario": self._scenario.description or "a station",

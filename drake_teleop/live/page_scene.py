@@ -48,7 +48,7 @@ class PageScene:
             self._report_scene_failure(error)
 
     def scene_values(self, rows: LogRows) -> dict[str, Any]:
-        """Return the page's message of the last row: 4x4 poses (column-major), sizes by path."""
+        """Return the frame's part for the last row: 4x4 poses (column-major) and sizes by path."""
         moves = {} if self.failure else self._scene_poses_and_sizes_of_last_row(rows)
         return {"view": self.name, "no_view": self.failure, "moves": moves}
 

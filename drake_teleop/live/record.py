@@ -58,7 +58,7 @@ class SessionRecord:
         try:
             write_scenario(folder / SCENARIO_FILE, scenario)
             if device:
-                write_text(folder / DEVICE_MARKER_FILE, "x to rz are poses of a haptic device.\n")
+                write_text(folder / DEVICE_MARKER_FILE, "inputs.csv: x to rz are device poses.\n")
             if load is not None:
                 write_cached_load(folder / LOAD_FILE, load)
             self._append_line(csv_header(versions_and_file_digest(scenario)))

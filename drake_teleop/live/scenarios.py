@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.identified_load import IdentifiedLoad
-from drake_teleop.live.inputs import AS_IN_SCENARIO_NAME, NETWORKS, SENSOR_NAMES, Inputs
+from drake_teleop.live.inputs import AS_IN_SCENARIO_NAME, NETWORK_NAMES, SENSOR_NAMES, Inputs
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import longest_delay
 from drake_teleop.station.environment.solids import Wall
@@ -37,7 +37,7 @@ SCENE_NAMES = ("own", *_SHIPPED_SCENES)
 
 
 def live_scenario(scenario: Scenario) -> Scenario:
-    """Return the scenario without intended motion, task and settling time; faults do not end it."""
+    """Remove intended motion, task, settling and end by faults; set Runge-Kutta integration."""
     return replace(
         scenario,
         operator__intent=[],
@@ -50,7 +50,7 @@ def live_scenario(scenario: Scenario) -> Scenario:
 
 
 def with_task_space_device(scenario: Scenario) -> Scenario:
-    """Return the scenario with a task-space device if its master is a serial arm."""
+    """Return the scenario, with a Haply Inverse3 in place of a master that is a serial arm."""
     if scenario.master.model not in (PHANTOM_NAME, LEADER_NAME):
         return scenario
     return replace(scenario, master=Master(model="haply_inverse3"))
@@ -80,7 +80,7 @@ def scenario_of_inputs(scenario: Scenario, load: IdentifiedLoad | None, inputs: 
         along, turning = (wave := scenario.passivity.wave).impedance
         impedance = [along, max(turning, _MIN_ROTATIONAL_WAVE_IMPEDANCE_NMS_RAD)]
         changes["passivity__wave"] = dataclasses.replace(wave, impedance=impedance)
-    name = NETWORKS[inputs.network]
+    name = NETWORK_NAMES[inputs.network]
     if name == "custom":
         delay, jitter = _DELAY_INPUT_UNIT_S * inputs.delay, _JITTER_INPUT_UNIT * inputs.jitter
         loss = _LOSS_INPUT_UNIT * inputs.loss
@@ -112,7 +112,7 @@ def _payload_phi(scenario: Scenario) -> Array:
 
 
 def adapt_estimate(before: Scenario, load: IdentifiedLoad | None, after: Scenario) -> Array | None:
-    """Return the estimate (16,) of `load` for `before`, corrected to payload, sensor of `after`."""
+    """Return the estimate (16,) of `load` in `before`, for the payload and sensor of `after`."""
     if load is None:
         return None
     estimate = load.estimate.copy()

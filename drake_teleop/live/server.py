@@ -54,10 +54,10 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
 _LOOPBACK_ADDRESS = "127.0.0.1"
 _MAX_CONNECTED_PAGES = 8
 # Iterations of asyncio's loop from a readable socket to a handled message.
-_LOOP_ITERATIONS_PER_RECEIVED_MESSAGE = 3
+_ASYNCIO_ITERATIONS_PER_MESSAGE = 3
 _MAX_UNSENT_BYTES_OF_PAGE = 2**18  # unsent bytes above which a slow page misses frames
 # Timeouts of the clients and of the drive's thread [s].
-_PAGE_CLOSE_TIMEOUT_S, _THREAD_END_TIMEOUT_S = 1.0, 4.0
+_PAGE_CLOSE_TIMEOUT_S, _THREAD_TIMEOUT_S = 1.0, 4.0
 # All other log entries of websockets are failed connections, which clients cause.
 _WEBSOCKET_LOGGER = logging.getLogger("drake_teleop.live.server")
 _WEBSOCKET_LOGGER.addFilter(lambda record: record.msg == "connection handler failed")
@@ -125,10 +125,10 @@ class LiveDrive:
             self._stop_threads_or_exit_process()
         self._raise_thread_failure()
 
-    def announce_and_wait(self, who: str) -> str:
-        """Print the page's address; wait for Ctrl-C or SIGTERM and return its name, or "stop"."""
+    def announce_and_wait(self, title: str) -> str:
+        """Print `title` and page address; wait for the end; return its cause, such as "Ctrl-C"."""
         condition = f"the simulation waits until this page is open{self._start_condition}"
-        print(f"{who} at {self.url}\n{condition}; Ctrl-C ends it", flush=True)
+        print(f"{title} at {self.url}\n{condition}; Ctrl-C ends it", flush=True)
         try:
             self.wait()
             return "stop"
@@ -149,14 +149,14 @@ class LiveDrive:
     def _stop_threads_or_exit_process(self) -> None:
         # Python may crash at exit while compiled code runs.
         self._stop.set()
-        end = time.monotonic() + _THREAD_END_TIMEOUT_S
+        end = time.monotonic() + _THREAD_TIMEOUT_S
         for thread in self._threads:
             while thread.is_alive() and (rest := end - time.monotonic()) > 0.0:
                 with contextlib.suppress(KeyboardInterrupt):
                     thread.join(rest)
         if any(thread.is_alive() for thread in self._threads):
             lost = "; its record may lack two seconds" if self._threads[0].is_alive() else ""
-            _print_to_stderr(f"error: drive: does not end within {_THREAD_END_TIMEOUT_S:g} s{lost}")
+            _print_to_stderr(f"error: the drive did not end within {_THREAD_TIMEOUT_S:g} s{lost}")
             sys.stdout.flush()
             os._exit(2)
 
@@ -235,7 +235,7 @@ class LiveDrive:
         if rest > 0:
             await asyncio.sleep(rest)
         time.sleep(self._live.time_to_next_tick(time.perf_counter()))
-        for _ in range(_LOOP_ITERATIONS_PER_RECEIVED_MESSAGE):
+        for _ in range(_ASYNCIO_ITERATIONS_PER_MESSAGE):
             await asyncio.sleep(0)
 
     async def _identify_load_and_change_scene(self) -> None:
@@ -271,7 +271,7 @@ class LiveDrive:
         return progress
 
     def _hello_message_json(self, page: ServerConnection) -> str:
-        return json.dumps({"hello": self._live.hello() | {"you": self._pages[page]}})
+        return json.dumps({"hello": self._live.hello_message() | {"you": self._pages[page]}})
 
     def _page_html(self) -> str:
         return resources.files("drake_teleop.live").joinpath("page.html").read_text("utf-8")

@@ -138,7 +138,7 @@ class _Station:
         self.station.GetInputPort("clutch").FixValue(self.context, [float(closed)])
 
     def take_over_state(self, replaced: _Station, new_channel: bool) -> float:
-        """Copy the replaced station's state; cross-fade from its force to that of this one.
+        """Copy the replaced station's state; cross-fade from its rendered force to the new one.
 
         Return the time [s] for which the clutch stays open: 0 without a new channel.
         """

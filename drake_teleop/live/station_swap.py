@@ -68,9 +68,9 @@ def _cross_fade_weight(start_and_duration, time):
 
 
 @njit(cache=True)
-def _blend_and_limit_wrench_into(wrench, old, share, max_force, out):
+def _blend_and_limit_wrench_into(wrench, old_wrench, weight, max_force, out):
     for i in range(6):
-        out[i] = share * wrench[i] + (1.0 - share) * old[i] if share < 1.0 else wrench[i]
+        out[i] = weight * wrench[i] + (1.0 - weight) * old_wrench[i] if weight < 1.0 else wrench[i]
     force = _force_norm(out)
     if force > max_force:
         for i in range(6):
@@ -85,7 +85,7 @@ def _force_norm(wrench):
 def build_master_side(
     builder: DiagramBuilder, master: System, inner_side: System, period: float, cross_fade: bool
 ) -> Diagram:
-    """Return a master side with exported ports and, if `cross_fade`, a block `CrossFade`."""
+    """Return `master` with the clutch port of `inner_side` and, if `cross_fade`, a `CrossFade`."""
     wrench = master.GetInputPort("wrench_command")
     if cross_fade:
         block = builder.AddNamedSystem("cross_fade", CrossFade(period))
@@ -136,23 +136,23 @@ class CrossFade(framework.LeafSystem):
 
     def force_above_limit(self, context: Context) -> float:
         """Return the force [N] by which `LimitForce` reduces the wrench; 0 during a cross-fade."""
-        share, max_force = context.get_discrete_state(self._state).value()
+        weight, max_force = context.get_discrete_state(self._state).value()
         force = _force_norm(self._wrench.Eval(context))
-        return max(force - max_force, 0.0) if share == 1.0 else 0.0
+        return max(force - max_force, 0.0) if weight == 1.0 else 0.0
 
     def _update_fade_weight_and_max_force(self, context: Context, state: DiscreteValues) -> None:
-        share, max_force = state.value(self._state)
-        if share < 1.0:
+        weight, max_force = state.value(self._state)
+        if weight < 1.0:
             change = context.get_numeric_parameter(self._change).value()
             state.get_mutable_value(self._state)[0] = _cross_fade_weight(change, context.get_time())
         elif max_force < math.inf and _force_norm(self._wrench.Eval(context)) <= max_force:
             state.get_mutable_value(self._state)[1] = math.inf
 
     def _calc_wrench(self, context: Context, output: framework.BasicVector) -> None:
-        share, max_force = context.get_discrete_state(self._state).value()
+        weight, max_force = context.get_discrete_state(self._state).value()
         wrench = self._wrench.Eval(context)
-        if share == 1.0 and max_force == math.inf:  # the usual case, in half the time
+        if weight == 1.0 and max_force == math.inf:  # the usual case, in half the time
             output.SetFromVector(wrench)
             return
         before = context.get_numeric_parameter(self._change).value()[2:]
-        _blend_and_limit_wrench_into(wrench, before, share, max_force, output.get_mutable_value())
+        _blend_and_limit_wrench_into(wrench, before, weight, max_force, output.get_mutable_value())

@@ -195,7 +195,7 @@ def test_trial_from_consent_to_results_and_its_drives_repeat(tmp_path):
     drive = read_drive(tmp_path / "drives" / "01" / "0000-1")
     assert all(inputs.sigma == 37 for ms, inputs in drive.changes[1:])
     assert drive.repeat(show_no_progress).t[-1] == pytest.approx(0.5, abs=0.03)
-    messages = json.dumps(person.frames) + json.dumps(person.guided.hello())
+    messages = json.dumps(person.frames) + json.dumps(person.guided.hello_message())
     assert "secret" not in messages
     assert all(f["inputs"]["sigma"] == 0 and f["inputs"]["gamma"] == 100 for f in person.frames)
     forces = [f["f"] for f in person.frames]

@@ -85,10 +85,12 @@ def test_invalid_packets_only_change_a_counter(link):
     for place in range(16, 88, 8):
         for value in (1e308, 1e30, np.nan, np.inf, -np.inf):
             odd.append(good[:place] + np.array([value], "<f8").tobytes() + good[place + 8 :])
-            # `behind` is only displayed: it is clipped to its range.
+            # `force_age_s` is only displayed: it is clipped to its range.
             assert unpack_state(odd[-1]) is None or (place == 80 and np.isfinite(value))
     far = DeviceState(1, 0.0, (0.0, 0.0, 0.0), (0.0, 1.8, 0.0, 0.0), 7, 1e9)
-    near = far._replace(quaternion_wxyz=(0.0, 1.0, 0.0, 0.0), flags=CLUTCH_OPEN_FLAG, behind=1.0)
+    near = far._replace(
+        quaternion_wxyz=(0.0, 1.0, 0.0, 0.0), flags=CLUTCH_OPEN_FLAG, force_age_s=1.0
+    )
     assert unpack_state(pack_state(far)) == near
     for places, values in zip(
         random.integers(0, 88, (500, 6)), random.integers(0, 256, (500, 6)), strict=True

@@ -161,7 +161,7 @@ class UselessStream(Stream):
     ("readings", "remedy"),
     [
         ([], "0 invalid .* check the source's address"),
-        ([DAMAGED_READING] * 7, "[1-9] invalid .* check --range and the values"),
+        ([DAMAGED_READING] * 7, r"[1-9]\d* invalid .* check --range and the values"),
     ],
 )
 def test_source_without_valid_readings_ends_after_the_maximum(

@@ -20,14 +20,14 @@ from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.plant import NominalSlave
 
-_MAX_FORCE_SCALE_PERCENT = INPUT_RANGES["gamma"][1]  # %
+_MAX_SCALE_INPUT_PERCENT = INPUT_RANGES["gamma"][1]  # %
 # Averaging time of a contact force [s], and smallest force of a touch [N].
 _FORCE_AVERAGING_TIME_S, _MIN_TOUCH_FORCE_N = 0.02, 0.5
 # The tip is on the floor of the slot within this distance [m] for this time [s].
 _MAX_SLOT_FLOOR_DISTANCE_M, _MIN_SLOT_FLOOR_TIME_S = 2e-3, 0.2
 
 
-def identified_load_unless_online(scenario: Scenario) -> IdentifiedLoad | None:
+def identify_load_unless_online(scenario: Scenario) -> IdentifiedLoad | None:
     return None if scenario.load_estimator.enabled else identified_load(scenario)
 
 
@@ -52,14 +52,14 @@ class Apparatus:
         `level`: rendered contact force [N] or added mass [kg]; `contact_force`: expected force [N].
         """
         condition = self.condition
-        share, gamma = 100.0 * condition.load_share, 100.0 * condition.gamma
+        share, gamma = 100.0 * condition.non_contact_scale, 100.0 * condition.gamma
         if isinstance(self.task, design.ContactDetection):
             gamma = max(1.0, gamma * level / contact_force) if level else 0.0
         elif isinstance(self.task, design.ApparentMass) and level:
             share += max(1.0, 100.0 * level / self.load_mass_at_hand)
         sigma = share if condition.eta is None else 0.0
         values = {"sigma": sigma, "sigma_object": share, "gamma": gamma}
-        return {name: min(round(value), _MAX_FORCE_SCALE_PERCENT) for name, value in values.items()}
+        return {name: min(round(value), _MAX_SCALE_INPUT_PERCENT) for name, value in values.items()}
 
     def interval_result(
         self, target: float, inputs: dict[str, int], rows: IntervalLog
@@ -75,7 +75,7 @@ class Apparatus:
         if isinstance(self.task, design.ContactDetection):
             level = force * inputs["gamma"] / (100.0 * self.condition.gamma)
             return IntervalResult(level if target else 0.0, force, valid=force > _MIN_TOUCH_FORCE_N)
-        added = inputs["sigma_object"] / 100.0 - self.condition.load_share
+        added = inputs["sigma_object"] / 100.0 - self.condition.non_contact_scale
         level = self.load_mass_at_hand * added
         return IntervalResult(level if target else 0.0, force)
 
@@ -107,7 +107,7 @@ def make_apparatus(
         mass = setup.slave.payload.mass
     at_hand = setup.force_scaling.force_scale * setup.kinematic_scaling.translation_scale
     mass_at_hand = float(mass) * at_hand
-    largest = mass_at_hand * (0.01 * _MAX_FORCE_SCALE_PERCENT - condition.load_share)
+    largest = mass_at_hand * (0.01 * _MAX_SCALE_INPUT_PERCENT - condition.non_contact_scale)
     if isinstance(task, design.ApparentMass) and largest < task.low:
         what = f"adds at most {largest:.3g} kg at the hand, below `low` of the task ({task.low:g})"
         remedy = "reduce sigma or `low`, or increase force_scale of the task's scenario"

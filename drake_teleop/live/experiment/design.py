@@ -7,7 +7,7 @@ from typing import NoReturn, TypeAlias
 from drake_teleop.common.config import check_all_field_values, choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import read_yaml
-from drake_teleop.live.inputs import AS_IN_SCENARIO_NAME, NETWORKS
+from drake_teleop.live.inputs import AS_IN_SCENARIO_NAME, NETWORK_NAMES
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.scenario import (
@@ -28,26 +28,26 @@ class Condition:
     """Condition of a trial, hidden from the participant."""
 
     name: str = plain("", "name in tables and pictures, hidden from participants")
-    sigma: float = quantity(0.0, "1", 0.0, 3.0, "rendered share of the non-contact wrench")
+    sigma: float = quantity(0.0, "1", 0.0, 3.0, "scale of the non-contact wrench")
     gamma: float = quantity(1.0, "1", 0.05, 3.0, "scale of the contact wrench")
     eta: float | None = quantity(
-        None, "1", 0.0, 1.0, "rendered share of a held object, with sigma = 0"
+        None, "1", 0.0, 1.0, "scale of a held object's non-contact wrench; requires sigma 0"
     )
     network: str = choice(
         AS_IN_SCENARIO_NAME,
-        tuple(name for name in NETWORKS if name != "custom"),
+        tuple(name for name in NETWORK_NAMES if name != "custom"),
         "network between master and slave",
     )
-    delay: float | None = quantity(None, "s", 0.0, 2.0, "delay of one way, in place of a network")
+    delay: float | None = quantity(None, "s", 0.0, 2.0, "one-way delay; replaces the network")
     method: str = choice(AS_IN_SCENARIO_NAME, (AS_IN_SCENARIO_NAME,), "passivity method", METHODS)
 
     @property
-    def load_share(self) -> float:
+    def non_contact_scale(self) -> float:
         return self.sigma if self.eta is None else self.eta
 
 
 @dataclass
-class _TaskFields:
+class _CommonTaskFields:
     scenario: str = plain("touch", "shipped name, or a YAML file with a path relative to this file")
     trials: int = quantity(40, "1", 1, 1000, "number of trials of each condition")
     practice: int = quantity(
@@ -57,8 +57,8 @@ class _TaskFields:
 
 @settings
 @dataclass
-class ContactDetection(_TaskFields):
-    """Task to identify the interval (of two) with rendered contact; the tool touches in both."""
+class ContactDetection(_CommonTaskFields):
+    """Task to identify the interval (of two) with rendered contact; both contain a contact."""
 
     low: float = quantity(0.2, "N", 1e-3, 1e3, "smallest rendered contact force at the tool")
     high: float = quantity(
@@ -70,23 +70,23 @@ class ContactDetection(_TaskFields):
 
 @settings
 @dataclass
-class ApparentMass(_TaskFields):
+class ApparentMass(_CommonTaskFields):
     """Task to identify the interval (of two) with the heavier tool; the hand moves in both."""
 
-    low: float = quantity(0.004, "kg", 1e-4, 10.0, "smallest additional mass at the hand")
-    high: float = quantity(0.15, "kg", 1e-3, 10.0, "largest additional mass, also for practice")
+    low: float = quantity(0.004, "kg", 1e-4, 10.0, "smallest added mass at the hand")
+    high: float = quantity(0.15, "kg", 1e-3, 10.0, "largest added mass, also for practice")
     interval: float = quantity(4.0, "s", 0.5, 60.0, "length of an interval")
 
 
 @settings
 @dataclass
-class PegInSlot(_TaskFields):
+class PegInSlot(_CommonTaskFields):
     """Task to insert the tool into a slot; measured: time and contact force."""
 
-    scenario: str = plain("insert", "as for other tasks, with an operator's task !Insert")
+    scenario: str = plain("insert", "as in other tasks; its operator needs a task !Insert")
     trials: int = quantity(8, "1", 1, 1000, "number of trials of each condition")
     practice: int = quantity(1, "1", 0, 100, "number of practice trials")
-    timeout: float = quantity(30.0, "s", 1.0, 600.0, "time after which a trial has failed")
+    timeout: float = quantity(30.0, "s", 1.0, 600.0, "time limit; a longer trial has failed")
 
 
 Task: TypeAlias = ContactDetection | ApparentMass | PegInSlot
@@ -97,8 +97,8 @@ Task: TypeAlias = ContactDetection | ApparentMass | PegInSlot
 class SimulatedParticipant:
     """Participant of `--simulated`, who compares rendered forces of two intervals."""
 
-    noise: float = quantity(0.06, "N", 1e-4, 100.0, "standard deviation at rest, at the hand")
-    weber: float = quantity(0.1, "1", 0.0, 1.0, "standard deviation as a share of the response")
+    noise: float = quantity(0.06, "N", 1e-4, 100.0, "constant noise of the perceived force (std)")
+    weber: float = quantity(0.1, "1", 0.0, 1.0, "noise (std) relative to the perceived force")
     lapse: float = quantity(0.02, "1", 0.0, 0.5, "share of guessed answers")
     reach: float = quantity(0.088, "m", 1e-3, 0.3, "downward displacement of the hand for contact")
     sway: float = quantity(
@@ -118,7 +118,7 @@ class Experiment:
     feedback: str = choice(
         "vibration",
         ("vibration", "bar"),
-        "display of the rendered force: gamepad or haptic device, or also a bar",
+        "display of the rendered force: gamepad or haptic device; bar: also a bar on the page",
     )
     break_after: int = quantity(40, "1", 1, 10_000, "number of trials between breaks")
     seed: int = quantity(0, "1", 0, 1e9, "random seed")

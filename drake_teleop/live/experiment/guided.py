@@ -44,20 +44,20 @@ HAND_MOTION_INPUTS = ("x", "y", "z", "rx", "ry", "rz", "clutch")
 class GuidedExperiment:
     """Event handler of an experiment, with the interface of `Live`; `now`: clock time [s].
 
-    Each interval is a recorded live session; the page receives only the rendered force.
+    Each interval is a recorded live session. The page receives no force but the rendered one.
     """
 
     def __init__(
         self,
         procedure: Procedure,
-        stations: dict[tuple[int, int], Apparatus],
+        apparatuses: dict[tuple[int, int], Apparatus],
         scene_functions: Sequence[SceneFunction],
         now: float,
         link: DeviceLink | None = None,
     ) -> None:
         self.refused, self.requested_scene, self._write_error = 0, "", ""
         self._procedure, self._scene_functions = procedure, scene_functions
-        self._stations, self._link = stations, link
+        self._apparatuses, self._link = apparatuses, link
         self._drives = procedure.store.folder / "drives" / f"{procedure.participant:02}"
         self._driver: int | None = None
         self._intervals, self._phase_start, self._frame_due = 0, now, now
@@ -66,7 +66,7 @@ class GuidedExperiment:
     def _prepare_interval(self, now: float) -> None:
         procedure = self._procedure
         trial, self._prepared = procedure.trial, procedure.prepared_intervals
-        self._apparatus = self._stations[trial.task, trial.condition]
+        self._apparatus = self._apparatuses[trial.task, trial.condition]
         self._show = self._scene_functions[trial.task]
         insert = self._apparatus.base.operator.task
         insert = insert if isinstance(insert, Insert) else None
@@ -88,12 +88,12 @@ class GuidedExperiment:
         hidden = ("measured_wrench_S", "load_estimate")
         return self._show(rows | {name: np.zeros_like(rows[name]) for name in hidden})
 
-    def hello(self) -> dict[str, Any]:
+    def hello_message(self) -> dict[str, Any]:
         procedure = self._procedure
         known = {"scenario": f"Participant {procedure.participant}", "scenes": []}
         hidden = {"object": False, "known": False, "noise": False, "touch": 0.01}
         study = {"feedback": procedure.experiment.feedback, "device": self._link is not None}
-        return self._live.hello() | known | hidden | {"study": study}
+        return self._live.hello_message() | known | hidden | {"study": study}
 
     def join(self, client: int, now: float) -> None:
         if self._driver is None:
@@ -114,9 +114,9 @@ class GuidedExperiment:
         self._live.leave(self._driver, now)
         self._driver = None
         self._procedure.restart_trial()
-        self._prepare_interval_if_changed(now)
+        self._prepare_interval_if_procedure_did(now)
 
-    def _prepare_interval_if_changed(self, now: float) -> None:
+    def _prepare_interval_if_procedure_did(self, now: float) -> None:
         with self._catch_write_error():
             if self._procedure.prepared_intervals != self._prepared:
                 self._live.end_session()
@@ -150,7 +150,7 @@ class GuidedExperiment:
             procedure.advance_phase()
         if (procedure.phase, procedure.num_completed_trials) == before:
             return
-        self._prepare_interval_if_changed(now)
+        self._prepare_interval_if_procedure_did(now)
         self._phase_start = now
         if procedure.phase == INTERVAL_PHASE:
             self._live.pace.restart(now)
@@ -199,7 +199,7 @@ class GuidedExperiment:
         result = self._apparatus.interval_result(level, self._stimulus, self._rows)
         self._procedure.finish_interval(dataclasses.replace(result, lost_s=live.pace.lost_time_s))
         self._phase_start = self._frame_due = now
-        self._prepare_interval_if_changed(now)
+        self._prepare_interval_if_procedure_did(now)
 
     def frame(self) -> dict[str, Any]:
         inner = self._live.frame()
@@ -248,20 +248,20 @@ class ExperimentDrive(LiveDrive):
         if device is not None:
             scenarios = [with_task_space_device(scenario) for scenario in scenarios]
         self._procedure = procedure
-        self._stations = make_apparatuses(procedure.experiment, scenarios)
+        self._apparatuses = make_apparatuses(procedure.experiment, scenarios)
         super().__init__(scenarios[0], None, port, device)
 
     def _build_scenes_and_compile(self, scenario: Scenario, device: bool) -> None:
         for task in range(len(self._procedure.experiment.tasks)):
-            setup = self._stations[task, 0].scenario
+            setup = self._apparatuses[task, 0].scenario
             self._views[str(task)] = PageScene(str(task), setup, forces=False)
-        first = self._stations[0, 0]
+        first = self._apparatuses[0, 0]
         compile_slice_functions(first.scenario, first.load, device)
 
     def _make_live_session(self, scenario: Scenario, record: Path | None) -> Any:
         scenes = [view.scene_values for view in self._views.values()]
         now = time.perf_counter()
-        return GuidedExperiment(self._procedure, self._stations, scenes, now, self._link)
+        return GuidedExperiment(self._procedure, self._apparatuses, scenes, now, self._link)
 
     def _page_html(self) -> str:
         panel = resources.files("drake_teleop.live.experiment") / "page.html"

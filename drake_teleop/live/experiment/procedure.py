@@ -36,7 +36,7 @@ class IntervalResult:
         force_N: largest 20 ms mean of the contact force.
         valid: False if a required contact is missing.
         done: True if the peg reached the slot's floor.
-        time_s: time until then, otherwise the duration.
+        time_s: time until the peg reached the floor, otherwise the duration.
         lost_s: delay of the simulation behind real time.
     """
 

@@ -20,7 +20,7 @@ _NUM_GRID_THRESHOLDS = 81
 _GRID_SLOPES = np.geomspace(0.7, 3.0, 7)
 _GRID_LAPSE_RATES = np.array([0.0, 0.02, 0.04, 0.08])
 # Factor of the range of thresholds beyond the range of levels.
-_THRESHOLD_MARGIN_FACTOR = 2.0
+_THRESHOLD_GRID_MARGIN = 2.0
 _NUM_STIMULUS_LEVELS = 25
 
 
@@ -43,7 +43,7 @@ class PsiMethod:
     def __init__(self, low: float, high: float) -> None:
         self.levels = np.geomspace(low, high, _NUM_STIMULUS_LEVELS)
         self._thresholds = np.geomspace(
-            low / _THRESHOLD_MARGIN_FACTOR, high * _THRESHOLD_MARGIN_FACTOR, _NUM_GRID_THRESHOLDS
+            low / _THRESHOLD_GRID_MARGIN, high * _THRESHOLD_GRID_MARGIN, _NUM_GRID_THRESHOLDS
         )
         self._grid = np.ix_(self._thresholds, _GRID_SLOPES, _GRID_LAPSE_RATES)
         shape = (_NUM_GRID_THRESHOLDS, len(_GRID_SLOPES), len(_GRID_LAPSE_RATES))

@@ -25,7 +25,7 @@ _PLOTTED_QUANTITIES = (
     "time to the floor [s]",
     "largest contact force [N]",
 )
-_COMPLETED_SHARE_QUANTITY = "share of trials done"
+_TRIALS_DONE_QUANTITY = "share of trials done"
 
 
 class ResultRow(NamedTuple):
@@ -51,20 +51,20 @@ def compute_results(experiment: Experiment, store: TrialStore) -> list[ResultRow
             each: dict[str, list[ResultRow]] = {}
             for n, rows in known.items():
                 done = [r for r in rows if (r.task, r.condition) == (kind, condition.name)]
-                for quantity, estimate in _participant_estimates(task, done).items():
+                for quantity, estimate in _estimate_quantities(task, done).items():
                     result = ResultRow(kind, condition.name, n, len(done), quantity, *estimate)
                     each.setdefault(quantity, []).append(result)
             for quantity, one in each.items():
                 found += one
                 if len(one) > 1:
-                    values, share = [r.value for r in one], quantity == _COMPLETED_SHARE_QUANTITY
-                    over = _mean_with_interval(values, share=share)
+                    values, are_shares = [r.value for r in one], quantity == _TRIALS_DONE_QUANTITY
+                    over = _mean_with_interval(values, are_shares=are_shares)
                     trials = sum(r.trials for r in one)
                     found.append(ResultRow(kind, condition.name, 0, trials, quantity, *over))
     return found
 
 
-def _participant_estimates(task: Task, rows: Sequence[TrialRow]) -> dict[str, EstimateWithLimits]:
+def _estimate_quantities(task: Task, rows: Sequence[TrialRow]) -> dict[str, EstimateWithLimits]:
     if not rows:
         return {}
     if isinstance(task, PegInSlot):
@@ -73,7 +73,7 @@ def _participant_estimates(task: Task, rows: Sequence[TrialRow]) -> dict[str, Es
 
         share = binomtest(len(done), len(rows))
         interval = share.proportion_ci(method="wilson")
-        found = {_COMPLETED_SHARE_QUANTITY: EstimateWithLimits(share.statistic, *interval)}
+        found = {_TRIALS_DONE_QUANTITY: EstimateWithLimits(share.statistic, *interval)}
         if done:
             found["time to the floor [s]"] = _mean_with_interval([row.time_s for row in done])
             found["largest contact force [N]"] = _mean_with_interval([row.force_N for row in done])
@@ -88,14 +88,14 @@ def _participant_estimates(task: Task, rows: Sequence[TrialRow]) -> dict[str, Es
     return {name: psi.threshold(), f"d' at {middle:.3g} {unit}": psi.estimate_d_prime(middle)}
 
 
-def _mean_with_interval(values: Sequence[float], *, share: bool = False) -> EstimateWithLimits:
-    """Return the geometric mean (arithmetic for a `share`) with Student's 95 % interval."""
-    x = np.asarray(values) if share else np.log(np.maximum(values, 1e-9))
+def _mean_with_interval(values: Sequence[float], *, are_shares: bool = False) -> EstimateWithLimits:
+    """Return the geometric mean (arithmetic for shares) with Student's 95 % interval."""
+    x = np.asarray(values) if are_shares else np.log(np.maximum(values, 1e-9))
     mean, half = float(x.mean()), math.nan
     if len(x) > 1:
         half = float(stdtrit(len(x) - 1, 0.975) * x.std(ddof=1) / math.sqrt(len(x)))
     found = (mean, mean - half, mean + half)
-    if share:
+    if are_shares:
         return EstimateWithLimits(*(min(max(v, 0.0), 1.0) if v == v else v for v in found))
     return EstimateWithLimits(*(math.exp(v) for v in found))
 

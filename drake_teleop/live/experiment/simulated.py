@@ -10,7 +10,7 @@ import numpy as np
 from drake_teleop.live.experiment.apparatus import (
     Apparatus,
     IntervalLog,
-    identified_load_unless_online,
+    identify_load_unless_online,
     make_apparatus,
 )
 from drake_teleop.live.experiment.design import (
@@ -43,12 +43,12 @@ _LOG_READ_PERIOD_MS = 200
 def make_apparatuses(
     experiment: Experiment, scenarios: list[Scenario]
 ) -> dict[tuple[int, int], Apparatus]:
-    stations = {}
+    apparatuses = {}
     for t, (task, scenario) in enumerate(zip(experiment.tasks, scenarios, strict=True)):
-        load = identified_load_unless_online(scenario)
+        load = identify_load_unless_online(scenario)
         for c, condition in enumerate(experiment.conditions):
-            stations[t, c] = make_apparatus(task, condition, scenario, load)
-    return stations
+            apparatuses[t, c] = make_apparatus(task, condition, scenario, load)
+    return apparatuses
 
 
 def with_interval_seed(scenario: Scenario, procedure: Procedure) -> Scenario:
@@ -59,17 +59,17 @@ def with_interval_seed(scenario: Scenario, procedure: Procedure) -> Scenario:
 
 def simulate_participant(
     procedure: Procedure,
-    stations: dict[tuple[int, int], Apparatus],
+    apparatuses: dict[tuple[int, int], Apparatus],
     progress: Callable[[int, int], None],
 ) -> None:
-    """Run the remaining trials; keys of `stations`: indices of task and condition.
+    """Run the remaining trials; keys of `apparatuses`: indices of task and condition.
 
     After each phase, `progress` receives the numbers of finished and of all trials.
     """
     experiment, responses = procedure.experiment, [0.0, 0.0]
     while procedure.phase != END_PHASE:
         if procedure.phase == INTERVAL_PHASE:
-            apparatus = stations[procedure.trial.task, procedure.trial.condition]
+            apparatus = apparatuses[procedure.trial.task, procedure.trial.condition]
             if isinstance(procedure.task, PegInSlot):
                 result = _simulate_peg_insertion(apparatus, procedure)
             else:
