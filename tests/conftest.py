@@ -65,12 +65,12 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
-    """Mark all cases of a test except the first n of its mark `quick_cases(n)` as `long`."""
+    """Mark all cases of a test except the first n of its mark `quick_cases(n)` as `slow`."""
     mark = item.get_closest_marker("quick_cases")
     if mark is not None:
         COLLECTED_CASES[test := item.nodeid.partition("[")[0]] += 1
         if COLLECTED_CASES[test] > mark.args[0]:
-            item.add_marker("long")
+            item.add_marker("slow")
 
 
 def pytest_collection_finish() -> None:

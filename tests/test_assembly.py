@@ -504,6 +504,7 @@ def test_the_slaves_signals_are_what_their_names_say(direct, slave):
     )
 
 
+@pytest.mark.slow
 def test_what_is_gripper_and_what_is_object_are_told_apart(slave):
     """A share eta of the object is displayed; the known load counts as the gripper.
 

@@ -379,7 +379,7 @@ def test_a_process_that_dies_or_hangs_is_a_row(
     assert "<summary>no start found</summary>link a&#124;b&#95;c: &lt;none&gt;</details> |" in page
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_six_published_arms_are_read_and_planned(arms: ModuleType, tmp_path: Path) -> None:
     robots = importlib.metadata.distribution("example-robot-data").locate_file("")
     (tmp_path / "example_robot_data").symlink_to(str(robots))

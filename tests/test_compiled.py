@@ -77,7 +77,6 @@ def package(tmp_path, monkeypatch):
     return folder
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "old", "new", "expected"),
@@ -261,7 +260,6 @@ Path(f"{me} has ended").touch()
 """
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_two_parallel_first_runs_store_the_right_code(tmp_path):
     """The result of `double(1.5)` stays 2 after such runs with numba's own cache."""

@@ -68,7 +68,6 @@ CASES = [
 ]
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "kind", "place", "length", "index", "size", "at", "hand"), CASES)
 def test_a_fault_is_faded_and_named(name, kind, place, length, index, size, at, hand, request):
@@ -85,6 +84,7 @@ def test_a_fault_is_faded_and_named(name, kind, place, length, index, size, at, 
     assert ("a fault: " in " ".join(told)) == bool(at or hand)
 
 
+@pytest.mark.slow
 def test_one_sample_of_1e9_newtons_is_not_in_the_filters(direct):
     """The sensor's offset causes it for one hand sample; filters are clean 0.5 ms later."""
     sensor = GetBlock(direct.station, "wrist_sensor")

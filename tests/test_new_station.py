@@ -51,7 +51,7 @@ def runs(monkeypatch):
     return calls
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_station_is_written_and_run(tmp_path, runs, capsys):
     new_command(tmp_path / "mine", ARM, "sensor", device="omega_6", sensor="ati_gamma_imu")
     path = tmp_path / "mine" / "station.yaml"
@@ -87,7 +87,7 @@ def test_beginners_page_matches_the_written_station(tmp_path, runs, monkeypatch)
     assert runs == [(Path("out/own/station.yaml"), Path("out/own/first_run"), {"quiet": False})]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_place_is_in_front_with_a_reachable_cube():
     arm = NominalSlave(LoadScenario("free_motion_force").slave).arm
     found = find_start_place(arm)
@@ -103,7 +103,7 @@ def test_place_is_in_front_with_a_reachable_cube():
         find_start_place(stiff)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("device", ["phantom_premium_15", "falcon"])  # high and low rates
 def test_rates_match_the_device(tmp_path, runs, device):
     """`analyze` requires that sampling instants coincide."""
@@ -231,6 +231,7 @@ def test_advised_line_of_directives_turns_z_to_the_tool(axis):
     np.testing.assert_allclose(z_in_sensor, np.eye(3)["xyz".index(axis)], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_home_joints_are_written_if_the_position_is_not_sufficient(tmp_path, runs):
     """The last joint of this arm cannot turn x_S forward."""
     text = ARM.read_text()
@@ -251,6 +252,7 @@ def test_home_joints_are_written_if_the_position_is_not_sufficient(tmp_path, run
     assert R_WS[2, 2] < -0.999 and abs(R_WS[1, 0]) > 0.999
 
 
+@pytest.mark.slow
 def test_arm_of_five_joints_starts_with_tool_down(tmp_path, runs, monkeypatch):
     monkeypatch.setattr(place, "_CUBE_HALF_EDGES_M", (*place._CUBE_HALF_EDGES_M, 2.0))
     path = tmp_path / "five.sdf"
@@ -297,7 +299,7 @@ def odd_names(count: int) -> list[str]:
     return [*PIECES, *drawn][:count]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_odd_names_are_preserved_or_refused(tmp_path, runs, monkeypatch):
     """Try names of the arm's file and folder, packages, tool and sensor frame."""
     plan = plan_station(ARM, "sensor")
@@ -324,7 +326,7 @@ def test_odd_names_are_preserved_or_refused(tmp_path, runs, monkeypatch):
     assert equal > 87
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["arm.sdf #2", "a\nb", "010", "%41"])
 def test_station_with_an_odd_name_refers_to_its_arm(name, tmp_path, runs):
     path, text = tmp_path / f"{name}.sdf", ARM.read_text()

@@ -123,7 +123,6 @@ for place in range(len(good)):
 """
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("bits", "options"),

@@ -79,7 +79,7 @@ def test_ci_runs_the_readmes_test_commands(tmp_path):
         "python3 -m venv --upgrade-deps .venv-test",
         "pip install -q --no-compile -e .[test,docs]",
         "pytest -n 2 --dist worksteal",
-        "pytest -n 2 --dist worksteal -m checks or long",
+        "pytest -n 2 --dist worksteal -m checks or slow",
         "python benchmarks/fuzz.py --seconds 20 --seed 1",
         "sphinx-build -q -W --keep-going -j 2 docs out/site",
     ]

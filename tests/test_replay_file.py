@@ -26,7 +26,7 @@ def test_replay_of_one_instant():
     np.testing.assert_array_equal(times, [1.0, 1.0])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_page_escapes_all_texts_and_numbers(tmp_path):
     reading = DisplayedNumber("<b>", "N", np.array([np.nan, 1.23456, 20.0]), "#0072B2")
     film = ReplayFile("</script><b>&", np.array([0.0, 0.5, 1.0]), 1.0, [reading], notes=("<i>",))

@@ -173,7 +173,6 @@ def test_load_errors_match_their_stated_deviations(identification):
     assert np.sum((low <= truth) & (truth <= high)) >= 13
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_files_are_reproducible_for_a_seed(quick):
     _, first = quick("first")
@@ -211,7 +210,6 @@ def test_table_contains_saturation_and_reason_of_failure(quick, capsys):
     assert "written to" in said
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_a_pose_out_of_reach_is_reported_with_its_time(quick):
     summary, _ = quick(
@@ -255,7 +253,6 @@ def test_residual_leaves_out_the_time_beside_a_contact(contact, before_s, counts
     assert (summary["residual_force_max_N"] > 40.0) == counts
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_detector_notices_contact_before_the_operator(tmp_path, capsys):
     text = (scenarios_dir() / "touch.yaml").read_text()

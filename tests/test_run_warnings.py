@@ -235,6 +235,7 @@ def test_overlap_at_the_start_is_reported_with_bodies_depth_and_remedy():
             assert warning.endswith("environment, or give another start in slave.home")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("limit", "count"), [(0.9, 1), (9.0, 0)])
 def test_motors_of_a_leader_that_limit_the_force_are_reported(limit, count):
     home = np.array([0.2, -0.6, 1.9, 0.3, 0.5, -0.2])
@@ -458,7 +459,6 @@ DRAWER = """<sdf version="1.9" xmlns:drake="drake.mit.edu"><model name="drawer">
 </model></sdf>"""
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(("damping", "chatters"), [(0.2, True), (3.0, False)])
 def test_chatter_on_a_spring_loaded_drawer_is_reported(tmp_path, damping, chatters):

@@ -98,6 +98,7 @@ def test_ports_equal_the_documented_ports(direct):
             assert port not in SIGNALS or size == len(SIGNALS[port].components)
 
 
+@pytest.mark.slow
 def test_custom_sides_of_the_docs_work(tmp_path, monkeypatch):
     """Run the custom master and the recorded slave of docs/station.md."""
     monkeypatch.chdir(tmp_path)
@@ -142,6 +143,7 @@ class Intent(LeafSystem):
         output.SetFromVector(intent_at(self._segments, self._start, context.get_time())[1][0])
 
 
+@pytest.mark.slow
 def test_intent_from_port_equals_intent_of_scenario():
     sine = Sine(
         duration=10.0, ramp=0.05, frequency=3.0, translation=[0.01, 0.02, 0.015],
@@ -371,7 +373,7 @@ def test_a_custom_channel_takes_the_place_of_the_scenarios():
         MakeTeleopStation(scenario, channel=Silent({}, {}))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_example_controllers_press_a_wall_without_creating_energy():
     """Each controller has at most 40 lines; energy is that at the actual motion, 50 ms each way."""
     page = Path(__file__).parents[1] / "docs" / "controllers.md"

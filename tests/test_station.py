@@ -67,7 +67,6 @@ def vertical(amplitude: float, frequency: float, **changes) -> Scenario:
     return replace(scenario, **changes)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("touched", "at_once"),
@@ -122,7 +121,6 @@ def test_wrist_wrench_equals_drakes_reaction_force(slave, touched, at_once):
     assert error < 1e-12
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "most"), [("free_motion_force", 1e-6), ("contact_transition", 0.15)]
@@ -233,6 +231,7 @@ def test_apparent_mass_is_the_device_with_sigma_0(felt):
     assert (hand / acceleration).real == pytest.approx(mass, rel=0.02)
 
 
+@pytest.mark.slow
 def test_energy_balance_of_the_ideal_loop(slave):
     """Held wrenches and torques do an exactly known work in each period."""
     scenario = vertical(
@@ -271,6 +270,7 @@ def test_energy_balance_of_the_ideal_loop(slave):
     assert np.ptp(stored) > 1.0
 
 
+@pytest.mark.slow
 def test_station_outputs_equal_the_plain_functions(slave):
     """The blocks call these functions, so equal inputs give equal outputs."""
     scenario = vertical(0.05, 2.0, force_scaling__sigma=0.5, wrist_sensor__ideal=False)
@@ -290,6 +290,7 @@ def test_station_outputs_equal_the_plain_functions(slave):
     np.testing.assert_array_equal(result["scaled_wrench_S"], wrench)
 
 
+@pytest.mark.slow
 def test_ideal_sensor_and_true_load_give_zero_contact_wrench(slave):
     scenario = vertical(0.06, 2.5, force_scaling__sigma=0.0)
     result = simulate(
@@ -413,6 +414,7 @@ def test_a_start_out_of_reach_is_one_clear_error():
         MakeTeleopStation(replace(Scenario(), slave__position=[1.4, 0.0, 0.45]))
 
 
+@pytest.mark.slow
 def test_command_far_out_of_reach_is_clamped_and_reported(slave):
     """All joints stay within their ranges."""
     sine = Sine(duration=100.0, ramp=0.5, frequency=0.4, translation=[0.0, 0.06, 0.0])
@@ -491,6 +493,7 @@ def test_joint_range_violation_ends_the_simulation(slave):
     assert replace(scenario, **{way.replace(".", "__"): servo}).joint_control.servo == servo
 
 
+@pytest.mark.slow
 def test_identification_does_not_change_the_station(slave):
     """Stations do not share state."""
     short = Simulation(duration=0.02)

@@ -69,6 +69,7 @@ def assert_same(found: SimulationResult, expected: SimulationResult, samples=sli
         np.testing.assert_array_equal(found[name], expected[name][samples])
 
 
+@pytest.mark.slow
 def test_the_parts_are_the_log_that_is_kept_in_memory(tmp_path, in_memory):
     folder = tmp_path / "log.parquet"
     assert_same(run(log=folder), in_memory)
@@ -78,6 +79,7 @@ def test_the_parts_are_the_log_that_is_kept_in_memory(tmp_path, in_memory):
     assert [path.name for path in tmp_path.iterdir()] == ["log.parquet"]
 
 
+@pytest.mark.slow
 def test_looking_at_the_progress_changes_nothing():
     """Include 0.14 s, which is not 7 times 0.02 s in floating point."""
     often = replace(SCENARIO, rates__log_hz=8000.0, simulation__duration=0.25)
@@ -138,6 +140,7 @@ def test_ctrl_c_while_a_part_is_written_neither_loses_nor_doubles_rows(
     assert_same(kept, in_memory, slice(len(kept.t)))
 
 
+@pytest.mark.slow
 def test_a_log_replaces_an_earlier_one_but_nothing_else(tmp_path, in_memory):
     folder = tmp_path / "log"
     in_memory.write_parquet(folder)
@@ -189,7 +192,6 @@ def start_and(kill: signal.Signals, folder: Path) -> tuple[str, int]:
     return process.communicate(timeout=60)[1], process.returncode
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGTERM])
 def test_a_killed_run_leaves_rows_without_gaps(tmp_path, kill):

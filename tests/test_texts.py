@@ -242,7 +242,7 @@ DATA = st.recursive(
 )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @given(DATA)
 def test_written_yaml_is_read_back(data) -> None:
     """Read the text with this package and with YAML 1.1, whose numbers and booleans differ."""

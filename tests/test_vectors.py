@@ -53,7 +53,6 @@ def solved(M, b, n):
     vectors.solve_by_cholesky(M, b, n)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 3, 6])
 def test_cholesky_and_solve_equal_numpy_and_read_the_lower_half(n):

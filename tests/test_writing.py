@@ -185,6 +185,7 @@ def little_work(monkeypatch):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", COMMANDS)
 def test_full_disk_at_any_file(tmp_path, monkeypatch, little_work, name):
     command, files, third = COMMANDS[name]

@@ -20,7 +20,7 @@ from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.slow
 
 PICTURES = ("bode", "nyquist", "passive", "widths", "maps")
 

@@ -59,7 +59,6 @@ def assert_agrees(
     assert response.coherence(output, input_).min() > 0.95
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_station_with_displayed_tool_agrees_with_linearisation():
     response, predicted = measured(station(sigma=1.0, coulomb=0.0))
@@ -70,7 +69,6 @@ def test_station_with_displayed_tool_agrees_with_linearisation():
     assert response.apparent_mass() == pytest.approx(3.13, rel=0.01)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_friction_without_displayed_tool_changes_only_the_device():
     response, predicted = measured(station(sigma=0.0, coulomb=1.0))
@@ -97,6 +95,7 @@ def test_multisine_has_odd_multiples_and_low_peak():
     assert np.abs(velocity).max() / velocity.std() < 2.2
 
 
+@pytest.mark.slow
 def test_unsuitable_multisine_raises():
     scenario = station(sigma=1.0, coulomb=0.0)
     task = task_direction(scenario, UP)
@@ -107,6 +106,7 @@ def test_unsuitable_multisine_raises():
         few.apparent_mass()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", [False, True])
 @pytest.mark.parametrize("method", ["rls", "rtls"])
 def test_load_is_that_of_the_argument_or_else_of_the_scenarios_estimator(

@@ -131,7 +131,6 @@ def difference(H, other):
     return np.abs(H / other - 1).max(axis=0)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 1.0])
 @pytest.mark.parametrize("servo", [{}, DEADBEAT], ids=["servo", "ideal servo"])
@@ -148,7 +147,6 @@ def test_one_direction_equals_the_analytical_model(servo, sigma):
     assert (difference(H, exact_two_port(scenario, OMEGA)) < 1e-6).all()
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 1.0])
 def test_station_agrees_with_sampled_model_within_1_percent_up_to_30_hz(sigma):
@@ -164,7 +162,6 @@ def test_station_agrees_with_sampled_model_within_1_percent_up_to_30_hz(sigma):
     assert (difference(H, sampled_two_port(axis, sampling, OMEGA)) < 0.01).all()
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 1.0])
 def test_closed_form_with_delays_of_holds_and_filter_agrees(sigma):
@@ -191,7 +188,6 @@ def test_closed_form_with_delays_of_holds_and_filter_agrees(sigma):
     assert (difference(H, paper) < 0.01).all()
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_sideways_force_rotates_the_tool():
     """The tool's centre of mass moves 0.61 times as much as So, or as the tip."""
@@ -210,7 +206,6 @@ def test_sideways_force_rotates_the_tool():
     assert np.abs(H[:, 0, 0] / paper[:, 0, 0] - 1).max() < 1e-3
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_sideways_tip_compliance_includes_the_hands_wrist():
     """A force at the tip is a torque at the hand, which rotates the tool: 130 times softer."""
@@ -237,7 +232,6 @@ def leaf(scenario: Scenario) -> Scenario:
     return replace(scenario, sheet_spring=sheet)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_displayed_stiffness_is_that_of_leaf_and_bodies_in_series():
     scenario = leaf(LoadScenario("free_motion_force"))
@@ -279,7 +273,6 @@ def vertical_mode(system: Linearization) -> complex:
     return np.log(z[np.argmax(np.abs(seen * push) * lasting)]) / PERIOD
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_multipliers_predict_a_slow_decay():
     scenario = frictionless(LoadScenario("ideal_sensor"))
@@ -298,7 +291,6 @@ def test_multipliers_predict_a_slow_decay():
     assert_same_rate(fitted_rate(height, predicted), predicted)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_multipliers_predict_growth_over_a_network():
     """Pressing on the leaf over 20 ms is unstable."""
@@ -395,6 +387,7 @@ def test_rates_method_and_direction_without_linear_model_raise():
         task_direction(scenario, (0.0, 0.0, 0.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "blocks",
     [

@@ -54,7 +54,7 @@ LONG = "sigma and delay, contact"
 
 @pytest.fixture(
     scope="module",
-    params=[pytest.param(name, marks=[pytest.mark.long] * (name == LONG)) for name in MAPS],
+    params=[pytest.param(name, marks=[pytest.mark.slow] * (name == LONG)) for name in MAPS],
 )
 def drawn(request: pytest.FixtureRequest) -> tuple[OneAxis, Sampling, StabilityMap]:
     axis, sampling, *parameters = MAPS[request.param]
@@ -84,7 +84,6 @@ def test_cells_agree_with_eigenvalues(drawn) -> None:
         assert grows(axis, sampling, **cell) == (found.num_unstable_multipliers[i, j] > 0), cell
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_stability_changes_within_1_percent_of_the_boundary(drawn) -> None:
     """The parameter other than delay varies by 1 %, at whole periods of delay."""

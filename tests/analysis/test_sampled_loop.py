@@ -77,7 +77,6 @@ axes = st.builds(
 )
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "sampling", [STATION, JR3, Sampling(joint_control_hz=10e3, low_pass_hz=500.0)]
@@ -241,7 +240,7 @@ def test_count_agrees_with_roots_also_at_both_ends_of_the_circle(
 @pytest.mark.parametrize(
     ("axis", "sampling"),
     [
-        pytest.param(held("light", sigma=1.0, wall_stiffness=0.0), STATION, marks=pytest.mark.long),
+        pytest.param(held("light", sigma=1.0, wall_stiffness=0.0), STATION, marks=pytest.mark.slow),
         (held("medium"), JR3),
         (held("medium", sigma=1.0), STATION),
         (held("medium", sigma=1.0), JR3),
@@ -299,7 +298,6 @@ def test_delay_margin_is_0_if_unstable_and_infinite_without_limit() -> None:
     assert (count_unstable_multipliers(firm, np.geomspace(5e-4, 100.0, 1000)) == 0).all()
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "axis", [held("medium", wall_stiffness=2.5e3), held("firm", wall_stiffness=2e4)]

@@ -391,6 +391,7 @@ def packet_of_slave(force: float, **changed: float) -> np.ndarray:
     return packet
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("field", ["CONTACT_FLAG", "WRENCH", "POSE"])
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_packet_that_is_not_finite_starts_the_safe_state(field, bad):
@@ -406,6 +407,7 @@ def test_packet_that_is_not_finite_starts_the_safe_state(field, bad):
     assert 5.0 < force[-1] < 10.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("field", ["CONTACT_FLAG", "WRENCH", "POSE"])
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_slave_brakes_smoothly_after_a_packet_that_is_not_finite(field, bad):
@@ -431,6 +433,7 @@ def test_contact_flag_of_a_packet_is_0_or_1(contact, flag):
     assert packet[fields.CONTACT_FLAG] == flag and packet[fields.SENDER_INPUTS_FINITE] == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_ends_and_networks_equal_the_channel_of_the_station(method):
     """Some silences are longer than the timeout."""
@@ -641,7 +644,7 @@ def test_a_saved_context_continues_in_another_block(name):
         np.testing.assert_array_equal(advance(second, k), advance(first, k))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_plain_and_joined_ports_give_the_same_scaled_wrench_over_many_samples():
     """10^4 random samples: `WrenchScaling` against the `ForceScaling` of the station."""
     rng = np.random.default_rng(6)

@@ -155,7 +155,7 @@ def test_ports_contain_the_work_of_the_hand(load_estimate):
     assert np.abs(work).max() > 1e-4
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_load_wrench_is_transformed_as_the_wrench():
     """The base is rotated and the scales are unequal."""
     scaling = KinematicScalingConfig(0.5, 0.2, alignment=[0.3, -0.4, 1.9])
@@ -236,7 +236,6 @@ def test_invalid_channel_is_rejected(changes, message, load_estimate):
         MakeTeleopStation(replace(Scenario(), **changes), load_estimate=load_estimate)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_temporary_failure_of_the_wrist_sensor_stops_the_station_smoothly(
     monkeypatch, load_estimate

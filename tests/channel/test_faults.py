@@ -93,7 +93,7 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
     return found
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_packets_contain_the_contact_flag(method):
     found = run(method, None)
@@ -103,7 +103,6 @@ def test_packets_contain_the_contact_flag(method):
     np.testing.assert_array_equal(told[late:], touched[: STEPS - late])
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("fault", FAULTS)

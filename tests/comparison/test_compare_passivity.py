@@ -23,7 +23,7 @@ from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
 from drake_teleop.station.scenario import LoadScenario
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.slow
 
 
 @pytest.mark.slow

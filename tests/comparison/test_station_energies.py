@@ -78,6 +78,7 @@ def test_torque_at_the_tool_works_only_along_rotation():
 GRIPPER = np.array([1.2, 0.01, -0.02, 0.06, 0.008, 1e-4, -2e-4, 0.009, 3e-4, 0.005])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "scales",
     [

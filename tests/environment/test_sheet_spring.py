@@ -54,7 +54,6 @@ STRIKE = [
 ]
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_a_contact_at_the_scenarios_step_agrees_with_a_tight_run():
     """RK2 at the sensor's 125 us differs by 8e-7 m from RK3 with error control at half of it."""

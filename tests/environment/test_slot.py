@@ -194,7 +194,6 @@ def distance_to(corners: np.ndarray, point: np.ndarray) -> float:
     return float(np.linalg.norm(point - nearest, axis=1).min())
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @given(
     yaw=st.floats(-3.1, 3.1),
@@ -301,6 +300,7 @@ def inserted():
     return scenario, simulate(station, scenario.simulation)
 
 
+@pytest.mark.slow
 def test_peg_enters_the_slot_and_rests_on_the_floor(inserted):
     _, result = inserted
     force = result["true_contact_wrench_W"][:, :3]

@@ -412,7 +412,6 @@ def test_block_of_any_edges_starts_on_its_table(size):
             np.testing.assert_allclose(part.min(axis=0), np.divide(edges, -2), atol=1e-12)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_pushed_block_resists_by_friction():
     """mu m g in steady sliding; the summary has the distance."""

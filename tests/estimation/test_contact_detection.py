@@ -125,7 +125,6 @@ def identified():
     return scenario, found.estimate, found.noise_floor(slave_arm(scenario))
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.0, 0.015, 0.05])
 def test_contact_is_detected_and_reaches_the_hand_after_the_delay(identified, delay):

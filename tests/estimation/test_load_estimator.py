@@ -69,7 +69,6 @@ def MakeEstimator(initial=None, **config):
     )
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["rls", "rtls"])
 def test_block_equals_the_estimator_of_logs(method):
@@ -84,6 +83,7 @@ def test_block_equals_the_estimator_of_logs(method):
     np.testing.assert_array_equal(history[19], history[20])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["rls", "rtls"])
 def test_settled_estimate_is_right(method):
     rows = samples(1)

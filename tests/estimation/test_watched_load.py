@@ -185,7 +185,6 @@ def test_estimate_changes_without_a_step(grasped):
     assert (steps <= 1e-3 / LOAD_FADE_TIME_S * np.ptp(phi[watched], axis=0) * 1.02).all()
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_contacts_are_not_a_change_of_load(prior):
     """Contacts of Fig. 8, and lasting contact with the leaf at rest and sliding, change nothing."""

@@ -107,7 +107,6 @@ def test_trajectory_depends_on_the_seed_only(slave, short):
     assert not np.allclose(other.rho, again.rho, atol=1e-3)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_executed_motion_respects_the_limits(slave):
     found = identify_load(LoadScenario("identification"))
@@ -171,7 +170,6 @@ def record(constants, memory, estimator, remembered, table, truth, noise, sample
         estimate_sample_into(estimator, remembered, table, reading, samples[k])
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("source", ["accelerometer", "fused", "encoders"])
 def test_predicted_and_observed_scatter_agree(slave, short, source):
@@ -217,7 +215,6 @@ def test_prediction_uses_the_heaviest_load_and_the_sensor(slave, designed):
     assert np.all(fused < accelerometer)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_check_finds_a_violation_of_each_limit(slave, short):
     """Each limit in turn is a little below its use by the same motion."""
@@ -314,7 +311,6 @@ def test_environment_of_the_scenario_is_avoided(name):
         assert not port.Eval(of_scene).HasCollisions()
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_readme_output(tmp_path, monkeypatch):
     (tmp_path / "models").symlink_to(models_dir())
@@ -324,7 +320,6 @@ def test_readme_output(tmp_path, monkeypatch):
     assert found.period == 6.0 and (tmp_path / "out" / "arm" / "excitation.html").exists()
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_infeasible_design_writes_no_file(slave, tmp_path, capsys):
     box = slave.limits._replace(box_half=np.full(3, 0.01))
@@ -389,7 +384,6 @@ def test_arm_that_rotates_its_sensor_about_one_axis_is_an_error(tmp_path, capsys
     assert "load_estimate" in message and "--time" not in message
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_identification_refuses_an_unsuitable_trajectory(short):
     scenario = LoadScenario("identification")
@@ -609,6 +603,7 @@ def test_package_may_have_the_name_drake(tmp_path):
     assert not any("shapes" in words for words in found.assumptions)
 
 
+@pytest.mark.slow
 def test_clearance_to_a_plane_is_checked(tmp_path):
     """A pendulum of 0.4 m above the floor."""
     model = tmp_path / "pendulum.xml"
@@ -708,7 +703,7 @@ def test_model_options_require_a_model(capsys, tmp_path):
     scope="module",
     params=[
         pytest.param((write_urdf, "l6", 6), id="urdf"),
-        pytest.param((write_sdf, "wrist", 7), id="sdf", marks=pytest.mark.long),
+        pytest.param((write_sdf, "wrist", 7), id="sdf", marks=pytest.mark.slow),
     ],
 )
 def other_arm(request, tmp_path_factory):
@@ -812,6 +807,7 @@ def test_identified_load_of_another_arm_is_true(other_arm, write_log, tmp_path):
     np.testing.assert_allclose(found.inertia_com, inertia, atol=0.05 * np.trace(inertia) / 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("found", ["none", "far from the start"])
 def test_small_motions_about_the_start_replace_designs_that_fail(slave, short, monkeypatch, found):
     """No design at all, and one whose posture is beyond the joint limits."""
@@ -833,7 +829,7 @@ def test_picture_of_a_shortest_motion_states_its_period(short):
     assert figure.axes[3].get_title("left") == "Criterion period: least value 2.4"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_coaxial_shapes_of_two_links_take_little_time(tmp_path):
     """Drake takes 0.1 s for one distance: 150 s of CPU for all postures, 3 s for the first."""
     model = tmp_path / "arm.xml"

@@ -174,7 +174,6 @@ def test_peg_is_done_after_200_ms_on_the_floor(height, done):
         assert rows.done_at == (0.1 if done and t > 0.3 else 0.0)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_trial_from_consent_to_results_and_its_drives_repeat(tmp_path):
     person = Participant(tmp_path)
@@ -216,6 +215,7 @@ def test_trial_restarts_after_the_page_is_closed(tmp_path):
     assert person.procedure.phase == "interval" and person.store.participant_numbers() == []
 
 
+@pytest.mark.slow
 def test_10000_random_messages_change_only_permitted_inputs():
     rng = np.random.default_rng(0)
     pieces = [

@@ -45,6 +45,7 @@ def test_joints_at_their_limits_are_named(scenario, rows):
     assert words(scenario, rows) == []
 
 
+@pytest.mark.slow
 def test_limits_faults_and_silence_are_reported_in_words(scenario, rows):
     peak = scenario.master.device(0.0, 0.0).parameters.peak_force
     strongest = f"the device renders its largest force, {peak:g} N"
@@ -63,6 +64,7 @@ def test_limits_faults_and_silence_are_reported_in_words(scenario, rows):
     assert words(scenario, rows, edge) == ["the hand is at the edge of its box, 0.3 m wide"]
 
 
+@pytest.mark.slow
 def test_forces_are_at_the_hands_scale_without_sensor_offset(scenario, rows):
     n = len(rows["t"])
     for name, first, last in (

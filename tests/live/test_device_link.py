@@ -446,6 +446,7 @@ def test_device_address_of_another_machine_or_kind_is_an_error(address):
         DeviceLink(address)
 
 
+@pytest.mark.slow
 def test_device_drives_without_a_page_and_releases_after_silence(scenario, load, link):
     live = Live(with_task_space_device(scenario), load, None, lambda rows: {}, 0.0, link)
     sender, seen = Sender(link.port), []

@@ -71,7 +71,7 @@ def log(folder: str) -> list[bytes]:
     return [part.read_bytes() for part in sorted(Path(folder, "log.parquet").iterdir())]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_drive_is_recorded_and_repeated(page, capsys):
     frames = page()
     type_in("docs/live.md", "drake-teleop drive contact_transition --record")
@@ -85,7 +85,7 @@ def test_a_drive_is_recorded_and_repeated(page, capsys):
     type_in("docs/start.md", ".venv/bin/drake-teleop drive")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_virtual_device_moves_the_hand(page, capfd):
     enough = threading.Event()
 
@@ -109,7 +109,7 @@ def test_virtual_device_moves_the_hand(page, capfd):
     assert json.loads(figures)["largest_force_n"] > 0.0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_experiment_starts_with_consent_and_draws_no_force(page, capsys, monkeypatch):
     monkeypatch.setattr(replay, "ForceArrow", None)  # fails if an arrow is drawn
     before, opened = ports(), list[int]()
@@ -133,7 +133,7 @@ def drive(*arguments: str) -> object:
     return ended.value.code
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
 def test_drive_reports_the_signal_that_ended_it(page, capsys, stop):
     frames = page(stop=stop)
@@ -146,7 +146,7 @@ def test_drive_reports_the_signal_that_ended_it(page, capsys, stop):
     assert read_drive("here").changes[-1][0] == pytest.approx(1e3 * float(seconds), abs=51)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_stopped_drive_ends_with_the_reason_and_status_2(page, capsys, monkeypatch):
     def fail(self, ms=5):
         raise RuntimeError("joint 2\nleaves its range")
@@ -159,7 +159,7 @@ def test_stopped_drive_ends_with_the_reason_and_status_2(page, capsys, monkeypat
     assert message.endswith("error: drive: the simulation has stopped: joint 2 leaves its range\n")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_incomplete_record_has_status_2(page, capsys, monkeypatch):
     def fail(self):
         raise DrakeTeleopError("no space left on device", where="here/log.parquet")

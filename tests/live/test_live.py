@@ -137,6 +137,7 @@ def test_removed_force_is_reported(scenario, load, clock, monkeypatch):
     assert pass_time(live, clock, FRAME_PERIOD_S)[-1]["words"] == [said]
 
 
+@pytest.mark.slow
 def test_new_scene_starts_a_drive_with_its_own_folder(scenario, load, clock, tmp_path):
     live = make(scenario, load, clock, tmp_path / "drive")
     (tmp_path / "drive-2").mkdir()
@@ -186,7 +187,6 @@ def test_simultaneous_drives_use_different_folders(scenario, load, tmp_path):
     assert read_drive(tmp_path).changes[-1][0] == 5
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("size_bytes", [60_000, 400_000])
 def test_full_disk_stops_the_drive_with_an_error(scenario, load, clock, tmp_path, size_bytes):

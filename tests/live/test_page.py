@@ -56,7 +56,6 @@ def speed_by_key(page: Page, slow: int, start: float) -> float:
     return float(np.median((z[end] - z[: len(end)]) / (t[end] - t[: len(end)])))
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_keys_move_the_hand_at_the_same_simulated_speed_in_slow_motion(page):
     page.until("typeof frame !== 'undefined' && frame && frame.tool && target && viewer")
@@ -69,7 +68,6 @@ def test_keys_move_the_hand_at_the_same_simulated_speed_in_slow_motion(page):
         assert speed_by_key(page, slow, start) == pytest.approx(0.12, rel=0.02)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_a_machine_that_is_too_slow_offers_slow_motion_with_one_click(page):
     page.until("typeof frame !== 'undefined' && frame && frame.tool && target")
@@ -84,7 +82,6 @@ def test_a_machine_that_is_too_slow_offers_slow_motion_with_one_click(page):
     page.until("document.querySelectorAll('#words button').length === 0")
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_page_controls_a_drive(page):
     page.until("typeof frame !== 'undefined' && frame && frame.tool && target && viewer")

@@ -88,7 +88,6 @@ def test_socket_requires_the_origin_of_our_page(live):
             until(page, lambda frame: False)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_port_in_use_is_one_error_line(live, scenario, load, monkeypatch):
     monkeypatch.setattr(server, "identified_load", lambda *_: load)
@@ -115,7 +114,6 @@ def test_record_is_removed_if_the_port_is_in_use(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_one_port_listens_also_when_the_scene_changes(scenario, load, monkeypatch):
     monkeypatch.setattr(server, "identified_load", lambda *_: load)
@@ -161,7 +159,6 @@ def hostile(host: str, token: str) -> Iterator[bytes]:
     yield b""
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_hostile_clients_cannot_end_or_delay_a_drive(scenario, load, monkeypatch, capfd):
     monkeypatch.setattr(server, "identified_load", lambda *_: load)
@@ -194,7 +191,6 @@ def test_hostile_clients_cannot_end_or_delay_a_drive(scenario, load, monkeypatch
     }
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_drive_ends_while_a_scene_identifies_its_load(scenario, load, monkeypatch):
     """The identification checks for the end in its progress function."""

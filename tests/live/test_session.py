@@ -74,7 +74,6 @@ def driven(scenario, load, tmp_path_factory):
     return folder, SimulationResult.read_parquet(folder / "log.parquet")
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_recorded_drive_repeats_for_any_slices(driven, scenario, load):
     folder, log = driven
@@ -103,7 +102,6 @@ def test_signals_are_continuous_when_inputs_change(driven, scenario):
     assert np.ptp(log["pose_command"][210:230], axis=0).max() > 1e-4
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_new_network_and_method_continue_the_state(scenario, load):
     """The channel changes in contact and back; the rendered wrench cross-fades."""
@@ -155,7 +153,6 @@ def test_rendered_wrench_cross_fades_at_a_constant_wrench():
     np.testing.assert_array_equal(rendered.Eval(context), wrench)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_force_limit_of_a_new_channel_ends_after_the_hand_eases_off(scenario, load):
     """A press is rendered at most 0.9 N harder, and in full from the next one on."""
@@ -180,6 +177,7 @@ def test_force_limit_of_a_new_channel_ends_after_the_hand_eases_off(scenario, lo
     assert np.abs(np.diff(until_it_leaves)).max() < 0.2
 
 
+@pytest.mark.slow
 def test_tool_follows_the_target_without_lag_and_stops_at_it(scenario, load):
     """The arm's servo has a lag of 10 ms."""
     session, speed = Session(scenario, load), 0.12
@@ -273,7 +271,6 @@ def test_released_hand_only_dissipates(driven):
     assert np.linalg.norm(log["hand_wrench_E"][:239, :3], axis=1).max() > 0.5
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_run_repeats_a_drive_to_the_same_bytes(driven, tmp_path, capsys, monkeypatch):
     folder, _ = driven
@@ -300,7 +297,6 @@ def test_run_repeats_a_drive_to_the_same_bytes(driven, tmp_path, capsys, monkeyp
         assert "error: " in capsys.readouterr().err
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_unclosed_drive_loses_two_seconds_of_log_and_no_input(scenario, load, tmp_path):
     """The files are those of a killed process."""

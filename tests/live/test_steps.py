@@ -2,6 +2,7 @@ import gc
 import weakref
 
 import numpy as np
+import pytest
 from pydrake.symbolic import Variable, if_then_else
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.primitives import SymbolicVectorSystem
@@ -67,6 +68,7 @@ def test_monitor_does_not_keep_the_simulator_alive():
     assert held() is None
 
 
+@pytest.mark.slow
 def test_contact_takes_two_steps_a_tick_and_few_rejected_ones(scenario, load):
     session = Session(scenario, load)
     integrator = session._station.simulator.get_integrator()

@@ -52,7 +52,7 @@ def add_impacts(wrench, seed=0):
     return wrench, hit
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(
     "noise", [NoiseStd(), NoiseStd(WRENCH_NOISE, s=0.1, omega=0.01, alpha=1.0)]
@@ -65,6 +65,7 @@ def test_exact_without_noise(method, noise):
     assert not result.rejected.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offsets", [True, False])
 def test_whitened_is_least_squares_with_the_channels_noise(offsets):
     F, *motion = record(noise=1.0)
@@ -212,7 +213,6 @@ def test_stated_deviations_hold_with_errors_in_variables():
     assert 0.4 < errors.mean() < 1.3
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_stated_deviations_are_not_too_large_where_noise_couples_the_channels():
     """Most noise is that of angular accelerations, which is in force and torque at once."""
@@ -292,7 +292,7 @@ def test_covariance_of_gains_is_the_sum_of_their_effects(method, offsets):
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_intervals_cover_the_truth_with_stated_gain_errors(method):
     rng, within, length = np.random.default_rng(4), [], np.repeat([1.0, GAIN_ERROR_TORQUE_ARM_M], 3)
@@ -338,7 +338,6 @@ def static_poses():
     return 9.81 * up / np.linalg.norm(up, axis=1, keepdims=True)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @settings(max_examples=10, deadline=None)
@@ -425,7 +424,6 @@ def test_load_of_each_workshop_tool_is_exact_without_noise(utias, method):
         assert max(mass, com, inertia) < 1e-6, file.stem
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_workshop_tools_are_identified_with_the_published_protocol(utias):
     for level, methods in utias.run(TOOLS, seeds=3).items():

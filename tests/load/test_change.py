@@ -54,7 +54,6 @@ def test_motion_of_the_benchmark_is_a_body_motion(bench):
     assert np.linalg.norm(s - 9.81 * up, axis=1).max() < 10.0
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_free_motion_is_not_a_load_change(bench, tool):
     for seed in SEEDS:
@@ -62,6 +61,7 @@ def test_free_motion_is_not_a_load_change(bench, tool):
         assert states.max() == KNOWN
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["grasp", "release"])
 def test_object_is_detected_and_identified(bench, tool, kind):
     """The alarm takes under 50 ms, the change under 0.5 s; the mass is within 1 %."""

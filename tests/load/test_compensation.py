@@ -25,7 +25,6 @@ def named(*values):
     return dict(zip(NAMES, values, strict=True))
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @given(vectors(6, 100.0), motions(), loads(), loads(), scales, scales, scales)
 def test_law_equals_that_of_the_paper(F, motion, gripper, thing, sigma_gr, sigma_obj, gamma):
@@ -36,6 +35,7 @@ def test_law_equals_that_of_the_paper(F, motion, gripper, thing, sigma_gr, sigma
     np.testing.assert_allclose(actual, expected, rtol=1e-10, atol=1e-7)
 
 
+@pytest.mark.slow
 @given(vectors(6, 100.0), motions(), loads())
 def test_elimination_leaves_the_contact(contact, motion, phi):
     F = contact + OFFSETS + non_contact_wrench(*motion, phi)

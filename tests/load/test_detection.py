@@ -69,7 +69,7 @@ def swing(samples: int, seed: int, largest: float = 5.0):
 # The noise floor
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @given(motions(), vectors(3, 20.0), arrays(np.float64, (16, 16), elements=st.floats(-0.1, 0.1)))
 def test_the_floor_is_the_sum_of_its_parts(motion, a, root):
     growth = np.arange(12.0).reshape(6, 2) * 0.01
@@ -98,7 +98,6 @@ def test_excitation_of_a_held_acceleration_fades():
     np.testing.assert_allclose(sigma**2, NOISE**2 + held[:, None], rtol=1e-12)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_known_noise_floor_is_estimated(seed):
@@ -120,6 +119,7 @@ def test_known_noise_floor_is_estimated(seed):
         assert (level[rows] ** 2 > chi2.isf(0.01, 6)).mean() == pytest.approx(0.01, abs=0.004)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fade", "seed"), [(0.0, 0), (0.9, 3), (0.997, 5)])
 def test_fitted_noise_floor_holds_accelerations_as_requested(fade, seed):
     rng, motion = np.random.default_rng(seed), swing(6000, seed)
@@ -249,7 +249,6 @@ def test_sums_detect_a_weak_contact_sooner_at_equal_false_alarms():
 # The detector
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @given(st.sampled_from(STATISTIC_NAMES), st.integers(0, 100))
 @settings(max_examples=20)

@@ -30,7 +30,6 @@ def test_motion_is_a_body_motion(benchmark):
     assert 2.0 < np.abs(alpha).max() < 60.0
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("level", ["JR3", "UTIAS High"])
 def test_total_least_squares_and_instruments_remove_the_bias(benchmark, level):

@@ -122,7 +122,7 @@ def test_stated_deviations_hold_for_white_noise():
     assert 0.8 < errors.mean() < 1.2
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_stated_deviations_hold_for_coloured_noise():
     def coloured(rng, n):
         white, noise = rng.normal(size=(n, 6)), np.zeros((n, 6))

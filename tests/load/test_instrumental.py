@@ -51,7 +51,7 @@ def stacked_regressor(motion):
     return np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
 
 
-@pytest.mark.parametrize("own", [pytest.param(True, marks=pytest.mark.long), False])
+@pytest.mark.parametrize("own", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_result_equals_three_stage_least_squares(own):
     """Compare with the stacked matrices; the motion as its own instrument gives weighted LS."""
     F, motion, commanded = record(0)

@@ -44,6 +44,7 @@ def state_of(estimator):
     return np.concatenate([estimator.offsets, estimator.phi])
 
 
+@pytest.mark.slow
 def test_result_is_least_squares_without_noise_of_the_motion():
     motion = rich_motion(2000)
     noise = NOISE * np.random.default_rng(0).normal(size=(2000, 6))

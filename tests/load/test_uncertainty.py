@@ -68,7 +68,6 @@ def turntable(samples=400):
 # ---- coverage
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("colour", study.COLOURS)
 def test_intervals_cover_the_truth_in_coloured_noise(colour):
@@ -426,7 +425,7 @@ SHARED = np.repeat([0.3, 0.01], 3)
 GROUPS = {"offsets": slice(0, 6), "mass": slice(6, 7), "first moments": slice(7, 10)}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(("repeats", "misfit"), [(1, 0.0), (8, 0.0), (8, 4.0)])
 def test_intervals_of_poses_at_rest_cover_the_truth(repeats, misfit):
     """An orientation may have an error that all of its repetitions share."""

@@ -62,7 +62,7 @@ def is_consistent_with_truth(found: IdentifiedLog) -> bool:
     return bool(load.identifiable[6] and not (wrong & load.identifiable).any())
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_factor_of_ten_in_the_torque_is_named(tmp_path: Path) -> None:
     found = identify_log(described(tmp_path, "02_onrobot_counts"))
     assert cause_names(found) == ["torque factor"]
@@ -72,14 +72,14 @@ def test_factor_of_ten_in_the_torque_is_named(tmp_path: Path) -> None:
     assert cause_names(counts) == [] and is_consistent_with_truth(counts)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_tilted_base_is_named(tmp_path: Path) -> None:
     found = identify_log(described(tmp_path, "03_base_tilt3"))
     assert cause_names(found) == ["gravity direction"] and is_consistent_with_truth(found)
     assert found.causes[0].values["gravity"] == pytest.approx([0.513, 0.0, -9.797], abs=0.02)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_load_grasped_in_the_middle_is_named(tmp_path: Path) -> None:
     found = identify_log(described(tmp_path, "04_grasp_midway"))
     assert cause_names(found) == ["load change"] and is_consistent_with_truth(found)
@@ -91,7 +91,7 @@ def test_load_grasped_in_the_middle_is_named(tmp_path: Path) -> None:
     assert com == pytest.approx([0.010, -0.015, 0.095], abs=3e-4)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_bare_flange_has_only_offsets(tmp_path: Path) -> None:
     found = identify_log(described(tmp_path, "05_nothing_attached"))
     assert cause_names(found) == ["no load"]
@@ -100,14 +100,14 @@ def test_bare_flange_has_only_offsets(tmp_path: Path) -> None:
     assert (np.abs(error) < 4.0 * found.identification.standard_deviations[:6]).all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_drift_of_a_warming_sensor_is_named(tmp_path: Path) -> None:
     found = identify_log(described(tmp_path, "09_warmup_drift"))
     assert cause_names(found) == ["drift"]
     assert found.identification.mass == pytest.approx(1.37, abs=0.003)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_contact_in_most_of_the_record_is_named(tmp_path: Path) -> None:
     found = identify_log(described(tmp_path, "11_wiping"))
     assert cause_names(found) == ["contact"] and is_consistent_with_truth(found)
@@ -115,7 +115,7 @@ def test_contact_in_most_of_the_record_is_named(tmp_path: Path) -> None:
     assert found.causes[0].stop_s == pytest.approx(37.5, abs=0.1)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_contact_and_the_opposite_sign_are_named(tmp_path: Path) -> None:
     found = identify_log(described(tmp_path, "11_wiping", sign=1))
     assert cause_names(found) == ["axes", "contact"]
@@ -123,7 +123,7 @@ def test_contact_and_the_opposite_sign_are_named(tmp_path: Path) -> None:
     assert found.identification.phi[:4] == pytest.approx(PHI[:4], rel=0.02)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_weight_removed_by_the_robot_is_named() -> None:
     found = identify_log(CASES / "14_weight_removed_30hz.csv")
     assert cause_names(found) == ["weight removed"]
@@ -138,7 +138,7 @@ def test_load_of_a_gripper_is_identified_at_30_hz(name: str, said: list[str]) ->
     assert found.identification.mass == pytest.approx(GRIPPER, abs=0.005)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_eliminate_subtracts_inertia_alone_where_the_weight_is_removed(tmp_path: Path) -> None:
     log = CASES / "14_weight_removed_30hz.csv"
     load = identify_log(log).identification

@@ -231,7 +231,7 @@ CASES: dict[str, tuple[str, Callable[[], Record]]] = {
 }
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_nothing_is_named_after_following_the_line_of_a_cause(case: str, tmp_path: Path) -> None:
     name, make = CASES[case]

@@ -63,6 +63,7 @@ def apply_remedy(path: Path, fields: dict[str, Any]) -> None:
     path.write_text(yaml.safe_dump(data))
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases(3)
 @pytest.mark.parametrize(
     ("ratio", "streams"),
@@ -89,6 +90,7 @@ def test_remedy_gives_the_load(tmp_path: Path, ratio: float, streams: str) -> No
     assert repaired.identification.identifiable[6]
 
 
+@pytest.mark.slow
 def test_positions_in_mm_are_no_clock_rate(tmp_path: Path) -> None:
     """A slow clock and a torque in N mm have nearly the same effect."""
     columns = planted.good()
@@ -97,6 +99,7 @@ def test_positions_in_mm_are_no_clock_rate(tmp_path: Path) -> None:
         identified(tmp_path, columns, "p")
 
 
+@pytest.mark.slow
 def test_inspect_names_the_clock_rate_alone(tmp_path: Path) -> None:
     path = planted.written(tmp_path, record(8.0, 2.0), imu=False)
     (finding,) = inspect_command(path, tmp_path / "out", quiet=True)["findings"]
@@ -104,6 +107,7 @@ def test_inspect_names_the_clock_rate_alone(tmp_path: Path) -> None:
     assert "set wrench.time.scale: 0.5" in finding["message"]
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases(1)
 @pytest.mark.parametrize("known_by", ["calendar", "gyroscope"])
 def test_known_clock_leaves_a_configured_payload(tmp_path: Path, known_by: str) -> None:

@@ -140,7 +140,7 @@ def test_free_motion_leaves_the_noise_of_the_sensor_also_at_the_ends() -> None:
     assert np.sqrt(np.mean([x[[0, -1]] for x in squares])) < 4.0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @settings(max_examples=4, deadline=None)
 @given(st.integers(0, 50), st.tuples(*[st.floats(-1, 1)] * 3), st.floats(0.35, 3.0))
 def test_any_large_rotation_of_the_wrench_is_found(
@@ -169,6 +169,7 @@ def files_of(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
+@pytest.mark.slow
 def test_lerobot_copy_has_contact_wrenches_and_the_same_other_bytes(tmp_path: Path) -> None:
     source = tmp_path / "demo"
     faults = {2: mapped(-QUARTER_Z)}
@@ -204,6 +205,7 @@ def test_lerobot_copy_has_contact_wrenches_and_the_same_other_bytes(tmp_path: Pa
     assert (tmp_path / "out" / "report.html").is_file()
 
 
+@pytest.mark.slow
 def test_a_killed_run_continues_to_the_same_bytes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -271,7 +273,7 @@ def described(folder: Path, prefix: str, **time: Any) -> Path:
     return folder / "columns.yaml"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_robomimic_file_gets_observations(tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py")
     path = tmp_path / "demo.hdf5"
@@ -290,7 +292,7 @@ def test_robomimic_file_gets_observations(tmp_path: Path) -> None:
         np.testing.assert_array_equal(file["data/demo_1/obs/pos"], sample_episode(1).position)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_zarr_gets_arrays(tmp_path: Path) -> None:
     zarr = pytest.importorskip("zarr")
     path = tmp_path / "demo.zarr"
@@ -310,7 +312,7 @@ def test_zarr_gets_arrays(tmp_path: Path) -> None:
     assert copied["data/in_contact"].dtype == bool
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_csv_episodes_keep_their_text(tmp_path: Path) -> None:
     source = tmp_path / "demo"
     source.mkdir()

@@ -38,6 +38,7 @@ def sway(size_mrad: float, noise_mm: float, sign: float = 1.0) -> Columns:
     return columns | {"s": still, "omega": still}
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases(3)
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(
@@ -61,6 +62,7 @@ def test_record_at_rest_causes_no_correction(
         assert (np.abs(load.offsets - OFFSETS) < 6.0 * stds).all()
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases(1)
 @pytest.mark.parametrize("noise_mm", [0.02, 0.3])
 def test_slow_rotation_corrects_the_sign(tmp_path: Path, noise_mm: float) -> None:
@@ -80,6 +82,7 @@ def test_noise_of_poses_is_no_motion(tmp_path: Path) -> None:
     assert explain_lack_of_motion(moving) is None
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases(1)
 @pytest.mark.parametrize(("size_mrad", "noise_mm"), [(0.0, 0.1), (3.0, 0.05), (10.0, 0.3)])
 def test_record_at_rest_has_one_pose_fit_and_no_search_over_wrench_edits(

@@ -275,6 +275,7 @@ def test_description_fields_override_topic_defaults(tmp_path: Path) -> None:
             load_description(described(tmp_path, **streams))
 
 
+@pytest.mark.slow
 def test_inspecting_a_bag_lists_its_topics_and_drafts_a_description(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

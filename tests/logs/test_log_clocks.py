@@ -192,7 +192,6 @@ def frame(t: np.ndarray, names: tuple[str, ...], values: np.ndarray) -> pl.DataF
     return pl.DataFrame({"t": t} | dict(zip(names, values.T, strict=True)))
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @settings(max_examples=8, deadline=None)
 @given(

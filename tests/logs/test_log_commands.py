@@ -81,9 +81,8 @@ def test_identify_finds_delay_and_load_in_a_noisy_log(tmp_path: Path) -> None:
     assert summary["not_identifiable"] == []
 
 
-@pytest.mark.long
-@pytest.mark.pictures
 @pytest.mark.slow
+@pytest.mark.pictures
 def test_identify_writes_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = simulated(tmp_path / "log.csv", noise=0.1)
     summary = identify_command(log, tmp_path / "a" / "b")
@@ -98,6 +97,7 @@ def test_identify_writes_its_files(tmp_path: Path, capsys: pytest.CaptureFixture
     assert capsys.readouterr().out == ""
 
 
+@pytest.mark.slow
 def test_stated_gain_errors_increase_the_deviations_with_an_imu(tmp_path: Path) -> None:
     path = written(tmp_path, good(), pose=False)
     exact = identify_log(path).identification

@@ -147,6 +147,7 @@ def test_the_threshold_does_not_rise_with_the_contacts(
     assert len(summarize_contacts(DT * np.arange(n), contact, found.touched)) == count
 
 
+@pytest.mark.slow
 def test_note_reports_too_much_contact() -> None:
     contact = low_pass(noise_of(4), DT, CUTOFF)
     assert detect(contact).notes == ()

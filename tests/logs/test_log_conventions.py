@@ -133,7 +133,6 @@ REAL: list[tuple[Callable[[Data, Tables], None], str, str]] = [
 ]
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("plant", "name", "says", "record"),
@@ -185,13 +184,14 @@ def test_loads_and_streams_of_any_kind_raise_no_alarm(tmp_path: Path, seed: int)
     assert findings(tmp_path, columns, **streams) == {}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_short_contact_on_a_light_load_is_no_alarm(tmp_path: Path) -> None:
     columns = good(phi=phi_from_mass_com_inertia(0.15, [0.0, 0.01, 0.04], 1e-4 * np.eye(3)))
     columns["force"][900:1100, 2] += 15 * np.sin(np.linspace(0, np.pi, 200))
     assert findings(tmp_path, columns) == {}
 
 
+@pytest.mark.slow
 def test_rate_of_a_held_sensor_is_reported(tmp_path: Path) -> None:
     columns = good()
     planted.held(columns)
@@ -201,7 +201,6 @@ def test_rate_of_a_held_sensor_is_reported(tmp_path: Path) -> None:
     assert "4.0 ms ahead" in found["lag"]
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_a_coarse_sensor_at_rest_repeats_rows_by_itself(tmp_path: Path) -> None:
     columns = good()
@@ -212,7 +211,7 @@ def test_a_coarse_sensor_at_rest_repeats_rows_by_itself(tmp_path: Path) -> None:
     assert "repeated rows" not in findings(tmp_path, columns)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_remedy_for_a_drifting_clock_is_correct(tmp_path: Path) -> None:
     columns = good()
     planted.drifting_clock(columns)
@@ -249,7 +248,6 @@ def test_identify_refuses_a_useless_result_with_the_reason(
         identify_command(written(tmp_path, columns), tmp_path / "out", quiet=True)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_identify_and_eliminate_pass_findings_on(tmp_path: Path) -> None:
     path = written(tmp_path, good())
@@ -268,7 +266,6 @@ def test_identify_and_eliminate_pass_findings_on(tmp_path: Path) -> None:
     assert [finding.name for finding in suspected] == ["sign"]
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("move", "force", "lag_s"),
@@ -364,6 +361,7 @@ def test_a_load_that_explains_less_than_half_is_refused_if_there_is_a_reason(
         )
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases(2)
 @pytest.mark.parametrize("start", [0.0, 1.0, 4.0])
 @pytest.mark.parametrize("drift", [2e-3, -3e-3])

@@ -43,6 +43,7 @@ def test_delay_is_estimated_within_a_fraction_of_a_sample(
     assert noisy == pytest.approx(delay_s, abs=2e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("duration", [0.5, 1.0, 4.0])
 @pytest.mark.parametrize("phi", [PHI, None])
 def test_delay_is_none_for_a_sensor_at_rest(duration: float, phi: np.ndarray | None) -> None:

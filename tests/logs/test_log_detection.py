@@ -70,6 +70,7 @@ def test_a_push_is_found_with_its_direction_and_place(tmp_path: Path, statistic:
     assert f"{touch['start_s']:.3f}" in result.output
 
 
+@pytest.mark.slow
 def test_log_without_load_and_free_record_uses_its_own(tmp_path: Path) -> None:
     log = log_with_push(tmp_path / "log.parquet", np.array([3.0, 0.0, 0.0]), 3)
     summary = detect_command(log, tmp_path, delay=0.0, quiet=True)
@@ -79,6 +80,7 @@ def test_log_without_load_and_free_record_uses_its_own(tmp_path: Path) -> None:
     assert summary["load"] is None
 
 
+@pytest.mark.slow
 def test_detect_and_eliminate_report_the_same_contacts_as_with_free_motion(tmp_path: Path) -> None:
     """A push of 20 N rises slowly and lasts a third of the record."""
     free = log_with_push(tmp_path / "free.parquet", np.zeros(3), 1)
@@ -116,6 +118,7 @@ def test_detect_and_eliminate_report_the_same_contacts_as_with_free_motion(tmp_p
     assert [c["start_s"] for c in summary["contacts"]] == [start_known]
 
 
+@pytest.mark.slow
 def test_poses_and_unknown_statistics_are_refused(ntnu: Path, tmp_path: Path) -> None:
     poses = describe_poses(tmp_path, ntnu, GRAVITY)
     with pytest.raises(DrakeTeleopError, match="at rest"):

@@ -56,10 +56,9 @@ def test_failing_check_does_not_stop_identify(sample_tables, error, monkeypatch)
     assert identify_log(folder / "free.yaml").identification.mass == pytest.approx(0.95, abs=2e-3)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [0.0, 1e-9])
 @pytest.mark.parametrize("value", [3.5, -1e4, 0.0])
-@pytest.mark.slow
 def test_constant_wrench_is_reported(sample_tables, change, value):
     """The driver of a sensor that is not connected repeats one value."""
     folder, wrench, pose = sample_tables
@@ -82,6 +81,7 @@ def findings_of_edited_channel(tmp_path, name, edit):
     return planted.findings(tmp_path, columns, imu=name == "omega")
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases(1)
 @pytest.mark.parametrize("name", ["force", "torque", "omega"])
 def test_channel_that_keeps_its_value_is_named_with_its_rows(tmp_path, name):
@@ -94,6 +94,7 @@ def test_channel_that_keeps_its_value_is_named_with_its_rows(tmp_path, name):
     assert f"{column} keeps the value" in message and "in rows 701 to 1100," in message
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases(1)
 @pytest.mark.parametrize("name", ["torque", "force"])
 def test_coarse_or_saturated_channels_are_not_frozen(tmp_path, name):

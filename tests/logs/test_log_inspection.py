@@ -63,13 +63,13 @@ PLANTED: list[tuple[Callable[[Columns], None], str, str, dict[str, bool]]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases(2)
 @pytest.mark.parametrize("streams", [{}, {"imu": False}, {"pose": False}])
 def test_good_log_has_no_finding(tmp_path: Path, streams: dict[str, bool]) -> None:
     assert findings(tmp_path, good(), **streams) == {}
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("plant", "name", "says", "streams"),
@@ -100,6 +100,7 @@ def test_two_errors_at_once_are_both_named(tmp_path: Path) -> None:
     assert "[[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]" in found["swapped axes"]
 
 
+@pytest.mark.slow
 def test_repeated_rows_are_named(tmp_path: Path) -> None:
     found = findings(tmp_path, {key: np.repeat(x, 2, axis=0) for key, x in good().items()})
     assert set(found) == {"clock jump", "repeated rows"}
@@ -133,6 +134,7 @@ def test_channel_without_any_number_is_no_crash(tmp_path: Path) -> None:
     assert "2000 rows contain NaN" in found["nan"] and "0 samples in" in found["unusable"]
 
 
+@pytest.mark.slow
 def test_a_wrong_clock_is_named_to_the_millisecond(tmp_path: Path) -> None:
     columns = good()
     columns["wrench_t"] = columns["t"] + 0.507
@@ -140,12 +142,14 @@ def test_a_wrong_clock_is_named_to_the_millisecond(tmp_path: Path) -> None:
     assert "wrench.time.offset: -0.507" in found["clock"]
 
 
+@pytest.mark.slow
 def test_a_lag_of_6_ms_is_named(tmp_path: Path) -> None:
     found = findings(tmp_path, good(delay_s=0.006))
     assert set(found) == {"lag"}
     assert "6.0 ms behind" in found["lag"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("deviation", "names"), [(0.001, set()), (0.0005, {"lag"})])
 def test_lag_below_five_standard_deviations_is_not_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, deviation: float, names: set[str]
@@ -158,6 +162,7 @@ def test_lag_below_five_standard_deviations_is_not_reported(
     assert {finding["name"] for finding in summary["findings"]} == names
 
 
+@pytest.mark.slow
 def test_an_inverse_orientation_is_read(tmp_path: Path) -> None:
     columns = good()
     planted.inverted(columns)
@@ -168,6 +173,7 @@ def test_an_inverse_orientation_is_read(tmp_path: Path) -> None:
     assert inspect_command(path, tmp_path / "out", quiet=True)["findings"] == []
 
 
+@pytest.mark.slow
 def test_inspect_drafts_a_description(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     c = good()
     data = {"stamp": (c["t"] * 1e6).astype(np.int64), "status": np.zeros(len(c["t"]))}
@@ -237,7 +243,6 @@ def as_written(form: str, c: Columns) -> tuple[dict[str, np.ndarray], str]:
     return {"%time": (1e9 * (1.6e9 + c["t"])).astype(np.int64)} | columns, ","
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("form", "sign"),
@@ -425,6 +430,7 @@ def test_unreadable_input_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "no such file" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases(1)
 @pytest.mark.parametrize("record", ["1-baseline", "2-vibrations"])
 def test_good_real_record_has_only_a_lag(ntnu: Path, tmp_path: Path, record: str) -> None:
@@ -434,6 +440,7 @@ def test_good_real_record_has_only_a_lag(ntnu: Path, tmp_path: Path, record: str
     assert summary["delay_s"] == pytest.approx(0.006, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_mounting_of_a_real_imu_is_found(ntnu: Path, tmp_path: Path) -> None:
     summary = inspect_command(ntnu_log(ntnu, tmp_path, "1-baseline"), tmp_path, quiet=True)
     assert [found["name"] for found in summary["findings"]] == ["swapped axes", "lag"]
@@ -443,7 +450,7 @@ def test_mounting_of_a_real_imu_is_found(ntnu: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("streams", [pytest.param({}, marks=pytest.mark.long), {"pose": False}])
+@pytest.mark.parametrize("streams", [pytest.param({}, marks=pytest.mark.slow), {"pose": False}])
 def test_reversed_gravity_is_not_reported_as_axes_and_a_torque_factor(
     tmp_path: Path, streams: dict[str, bool]
 ) -> None:
@@ -461,6 +468,7 @@ def test_constant_wrench_is_named(tmp_path: Path, streams: dict[str, bool]) -> N
     assert set(findings(tmp_path, columns, **streams)) == {"dead channel"}
 
 
+@pytest.mark.slow
 def test_edited_draft_is_kept(tmp_path: Path) -> None:
     """An unchanged draft is replaced, also by that of another table."""
     c = good()

@@ -67,6 +67,7 @@ def test_identify_reports_no_change_of_a_constant_load(tmp_path: Path) -> None:
     assert summary["causes"] == [] and summary["loads"] == []
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases(1)
 @pytest.mark.parametrize(("record", "cutoff_hz"), [("1-baseline", 30.0), ("2-vibrations", None)])
 def test_ntnu_records_have_one_load(
@@ -76,7 +77,7 @@ def test_ntnu_records_have_one_load(
     assert identify_log(describe_record(tmp_path, ntnu, record), cutoff_hz=cutoff_hz).loads == ()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("record", ["1-baseline", "2-vibrations"])
 def test_only_an_added_load_is_found(ntnu: Path, tmp_path: Path, record: str) -> None:
     """The log is unfiltered; the load is from poses of another day, with 2 % of model errors.
@@ -107,7 +108,7 @@ def test_only_an_added_load_is_found(ntnu: Path, tmp_path: Path, record: str) ->
     assert 0.0 < after[np.argmax(grasped == STATE_CHANGED)] < 0.5
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_ur5_pushes_are_not_a_load_change(ur5: Path, tmp_path: Path) -> None:
     """Eight pushes of up to 50 N act on a handle of 0.1 kg."""
     record = f"{ur5}/No9_Singularity_Free_ForceSensor__"
@@ -132,7 +133,6 @@ def test_ur5_pushes_are_not_a_load_change(ur5: Path, tmp_path: Path) -> None:
     assert identify_log(path).loads == ()
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_utias_records_have_one_load(utias: Path) -> None:
     """Ten tools from 9 g to 1 kg stop and go, with the noise that the authors call high."""
@@ -213,7 +213,6 @@ def load_wrench(t: np.ndarray, phi: np.ndarray) -> np.ndarray:
     return non_contact_wrench(at.specific_force, at.omega, at.alpha, phi)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_delay_is_that_of_the_fit_with_the_load_change(tmp_path: Path) -> None:
     t = np.arange(0.0, 20.0, 4e-3)

@@ -83,6 +83,7 @@ def findings_of(folder: Path, columns: Columns, motion: tuple[str, ...], **top: 
     return [f"{f.name}: {f.message}" for f in found if f.name != "lag"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("motion", [IMU, POSE, BOTH])
 def test_good_log_has_no_finding(good: Columns, tmp_path: Path, motion: tuple[str, ...]) -> None:
     assert findings_of(tmp_path, good, motion) == []
@@ -227,6 +228,7 @@ def imu_and_pose(frame: np.ndarray, **changed: np.ndarray) -> tuple[Description,
     )
 
 
+@pytest.mark.slow
 def test_mounting_in_the_description_is_corrected_from_the_left() -> None:
     at = motion_at(np.arange(0.0, 12.0, 0.01))
     R_SI = Rotation.from_euler("xyz", [30.0, 40.0, -70.0], degrees=True)
@@ -333,7 +335,6 @@ MISTAKES: list[tuple[str, Callable[[Columns], None], tuple[str, ...], str, str]]
 ]
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("plant", "motion", "name", "line"), [m[1:] for m in MISTAKES], ids=[m[0] for m in MISTAKES]
@@ -352,6 +353,7 @@ def test_planted_mistake_is_named(
     assert any(text.startswith(f"{name}: ") and line in text for text in found), found
 
 
+@pytest.mark.slow
 def test_identify_names_a_wrong_scale_despite_a_good_fit(tmp_path: Path) -> None:
     columns = record(16.0)  # only then is the mean of an acceleration small
     columns["specific_force"] = 1.05 * columns["specific_force"]
@@ -362,6 +364,7 @@ def test_identify_names_a_wrong_scale_despite_a_good_fit(tmp_path: Path) -> None
     assert found.name == "gravity"
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases(1)
 @pytest.mark.parametrize("scale", [16384 / 9.80665, 0.4])
 def test_accelerometer_in_no_known_unit_leaves_the_load_unknown(
@@ -374,6 +377,7 @@ def test_accelerometer_in_no_known_unit_leaves_the_load_unknown(
         identify_log(tmp_path / "log.yaml")
 
 
+@pytest.mark.slow
 def test_a_column_that_is_named_twice_is_named(good: Columns, tmp_path: Path) -> None:
     names = {"columns": ["torque_0", "torque_0", "torque_2"]}
     found = findings_of(tmp_path, good, IMU, torque=names)

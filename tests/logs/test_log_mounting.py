@@ -170,7 +170,6 @@ def test_lag_is_searched_within_one_second(lag: float, is_found: bool) -> None:
     assert (found.lag_s == pytest.approx(lag, abs=1e-3)) == is_found
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_deviations_equal_the_scatter_of_repeated_records() -> None:
     truth = [(random_rotation(seed), np.array([0.05, -0.03, 0.08])) for seed in range(16)]
@@ -393,6 +392,7 @@ def test_mirrored_axes_are_found_despite_a_lag() -> None:
     assert mounting(recorder, tables).is_mirrored
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases(1)
 @pytest.mark.parametrize("later", [0.2, -0.3])
 def test_lag_of_the_imu_is_reported_but_not_corrected(later: float) -> None:
@@ -432,7 +432,6 @@ def test_gaps_are_excluded_from_the_mounting() -> None:
 # Real records
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("record", "residual", "delay_s"),

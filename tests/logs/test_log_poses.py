@@ -93,6 +93,7 @@ def test_identify_compensates_for_noise_of_poses(from_whole):
     assert load.residual_rms[:3].max() < 0.1  # of 0.1 N before the low-pass
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bursts", [True, False])
 def test_load_is_identified_despite_inexact_stamps(from_whole, folder, tmp_path, bursts):
     """Five rows per stamp of 1 ms resolution, or 1.6 ms jitter and a clock 0.04 % faster."""
@@ -111,6 +112,7 @@ def test_load_is_identified_despite_inexact_stamps(from_whole, folder, tmp_path,
     assert any("pose.time.scale (1 by default) by 0.9996" in x for x in found.log.notes) != bursts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["consistent", "ordinary"])
 def test_stated_gain_errors_increase_the_deviations(folder, method):
     path = described(folder, "own", wrench={"gain_std": 0.01})
@@ -118,7 +120,6 @@ def test_stated_gain_errors_increase_the_deviations(folder, method):
     assert 0.005 * load.mass < load.standard_deviations[6] < 0.03 * load.mass
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_gain_errors_prevent_identification_unless_they_are_stated(folder):
     found = identify_log(described(folder, "gains"))
@@ -168,7 +169,6 @@ def test_long_log_read_in_parts_gives_the_same_load(from_whole, folder, tmp_path
     )
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_wrong_pose_frame_is_reported_with_the_lines_that_fix_it(folder):
     path = described(folder, "tcp")
@@ -187,7 +187,6 @@ def test_wrong_pose_frame_is_reported_with_the_lines_that_fix_it(folder):
     assert np.abs(deviations(found)).max() < 4.0
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_reported_frame_is_relative_to_S_not_to_the_description(folder, tmp_path):
     """The description has half of the shift; the report has the full shift."""

@@ -38,9 +38,8 @@ def record(path: Path) -> Path:
     return path
 
 
-@pytest.mark.long
-@pytest.mark.pictures
 @pytest.mark.slow
+@pytest.mark.pictures
 def test_page_is_self_contained_and_has_the_numbers_of_the_summary(tmp_path: Path) -> None:
     out = tmp_path / "out"
     summary = identify_command(record(tmp_path / "<log>.parquet"), out, delay=0.0, quiet=True)
@@ -135,7 +134,6 @@ def test_the_spectrum_has_the_power_of_the_signal() -> None:
     assert rate[np.argmax(density)] == pytest.approx(50, abs=0.3)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_report_states_the_samples_rejected_by_a_robust_fit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

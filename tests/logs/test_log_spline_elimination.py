@@ -143,7 +143,7 @@ def held_sample(
     return path
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [25.0, 30.0, 50.0, 60.0])
 def test_residual_at_the_rate_of_a_camera_is_the_noise_of_the_record(sample, tmp_path, rate):
     path = held_sample(sample, tmp_path, "free", rate)
@@ -157,6 +157,7 @@ def test_residual_at_the_rate_of_a_camera_is_the_noise_of_the_record(sample, tmp
     assert (left < 1.1 * SAMPLE_NOISE[[0, 3]]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [30.0, 50.0])
 def test_contacts_at_the_rate_of_a_camera_are_those_at_the_full_rate(sample, tmp_path, rate):
     held = held_sample(sample, tmp_path, "touched", rate)
@@ -172,7 +173,7 @@ def test_contacts_at_the_rate_of_a_camera_are_those_at_the_full_rate(sample, tmp
         )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(("rate", "seed"), [(30.0, 4), (125.0, 5), (1000.0, 6)])
 @pytest.mark.parametrize("touches", [(), TOUCHES])
 def test_residual_is_the_noise_of_the_sensor(tmp_path, rate, seed, touches):
@@ -250,7 +251,7 @@ def test_a_gap_of_the_poses_has_edges(tmp_path):
     assert (noise_ratio(found) < 1.2).all() and not found.touched.any()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_differentiated_motion_has_edges_of_half_a_window(tmp_path):
     """Splines need positions: half of 1.8 / 30 Hz, or four samples, at 125 Hz."""
     path = log_of(tmp_path, Kind(place=0.0, turn=0.0, seed=1))
@@ -289,7 +290,7 @@ def test_a_record_at_rest_takes_the_delay_of_the_load(tmp_path):
     assert (noise_ratio(found, TOUCHES) < 1.1).all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (0.0, 0.0, 0.15)])
 def test_an_imu_is_used_where_the_load_explains_more_with_it(tmp_path, shift):
     """Splines win with poses of S: the IMU's noise would leave three times the sensor's."""

@@ -446,7 +446,6 @@ with multiprocessing.get_context("fork").Pool(1) as pool:
 """
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_reading_in_a_forked_process_raises_error(tmp_path: Path) -> None:
     path = write(tmp_path / "x.csv", PLAIN)

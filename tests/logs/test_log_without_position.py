@@ -51,6 +51,7 @@ def assert_nothing_is_certain_and_wrong(found: IdentifiedLog, torque_factor: flo
     assert (error < 4.0 * np.sqrt(np.diag(load.covariance)))[known].all()
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases(1)
 @pytest.mark.parametrize("torque_factor", [1.0, 100.0, 0.01])
 def test_unknown_translation_corrects_neither_torque_unit_nor_pose_frame(
@@ -77,6 +78,7 @@ def test_acceleration_is_unknown_without_position_and_accelerometer(
     assert read_log(path).is_acceleration_unknown == (not has_position and not has_accelerometer)
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases(2)
 @pytest.mark.parametrize(
     ("place", "noise_factor"), [(COM, 0.1), ([0.0, 0.1, -0.3], 1.0), ([0.5, 0.0, 0.2], 1.0)]
@@ -94,12 +96,14 @@ def test_load_is_identified_if_the_sensor_turns_about_its_origin(tmp_path: Path)
     assert found.identification.identifiable.all() and found.findings == ()
 
 
+@pytest.mark.slow
 def test_stated_gain_errors_do_not_explain_an_unknown_translation(tmp_path: Path) -> None:
     record = Record.simulate(seconds=16.0)
     record.wrench_lines = {"gain_std": 0.01}
     assert_nothing_is_certain_and_wrong(identify(tmp_path, record))
 
 
+@pytest.mark.slow
 def test_oblique_rotation_of_the_sensor_is_not_named_as_a_permutation_of_axes(
     tmp_path: Path,
 ) -> None:

@@ -17,7 +17,7 @@ from planted_causes import run
 
 from drake_teleop.logs.processing import identify_log
 
-pytestmark = [pytest.mark.slow, pytest.mark.long]
+pytestmark = pytest.mark.slow
 
 
 @cache

@@ -133,6 +133,7 @@ def test_noise_of_splines_of_poses_and_imu_is_predicted():
     np.testing.assert_allclose(said / sums, 1.0, atol=0.2)
 
 
+@pytest.mark.slow
 def test_imu_reduces_the_deviations_with_noisy_poses():
     t, wrench, poses = poses_of(ROUGH)
     alone = estimate_from_poses(t, wrench, poses, GRAVITY_W)
@@ -151,7 +152,7 @@ def test_imu_with_other_axes_is_rejected():
     assert correct_imu_data(splines, other, GRAVITY_W) is None
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.slow  # two loads from files of 20 s
 def test_identify_uses_both_but_only_the_imu_if_the_pose_frame_is_wrong(tmp_path):
     kinds = Kind(seed=4), Kind(seed=4, p_SoPo_S=(0.0, 0.0, 0.1))

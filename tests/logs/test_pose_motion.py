@@ -246,6 +246,7 @@ def test_motion_map_is_that_of_a_rigid_body(rho, r, a, minus_g, alpha, w):
     np.testing.assert_allclose(z, np.concatenate(expected), atol=1e-12)
 
 
+@pytest.mark.slow
 @given(vector, vector, st.integers(0, 22))
 def test_columns_are_derivatives_of_the_residual(rho, r, k):
     R = rotation_matrices(rho[None], "rotation_vector")[0]

@@ -212,6 +212,7 @@ def test_row_numbers_in_messages_are_those_of_the_file(tmp_path: Path) -> None:
         read_log(described(tmp_path, both))
 
 
+@pytest.mark.slow
 def test_episodes_follow_each_other_on_one_clock(tmp_path: Path) -> None:
     """Each starts at zero; differences across their boundaries are not used."""
     parts = [table(start=0.0), table(start=11.0), table(start=25.0)]
@@ -383,7 +384,7 @@ def test_force_without_torque_is_reported_as_incomplete(tmp_path: Path) -> None:
     assert "A force alone is not enough: the commands need force and torque." in draft.text()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_two_tables_give_one_draft_with_the_sign_of_the_data(tmp_path: Path) -> None:
     """A trajectory of TUM has a position tx ty tz, which is no torque."""
     frame = table(sign=-1.0)
@@ -408,7 +409,7 @@ def test_two_tables_give_one_draft_with_the_sign_of_the_data(tmp_path: Path) -> 
     assert found.mass == pytest.approx(PHI[0], abs=5e-3)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("names", "axes", "guessed", "unit"),
     [
@@ -438,6 +439,7 @@ def test_the_order_of_euler_angles_is_that_of_the_data(
     assert ("Corrected by the data: the Euler angles" in text) == (axes != guessed)
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases(2)
 @pytest.mark.parametrize(
     ("names", "order", "form"),
@@ -521,7 +523,7 @@ def test_one_correction_of_a_rotation_vector_states_euler_angles(
     assert edited.pose.orientation.axes == axes and edited.pose.orientation.unit == unit
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(("axes", "sign"), [("xyz", -1), ("ZYX", 1), ("XYZ", -1)])
 def test_rx_ry_rz_can_be_euler_angles(tmp_path: Path, axes: str, sign: int) -> None:
     frame = table(sign=float(sign))
@@ -547,6 +549,7 @@ def test_first_line_of_numbers_is_no_header(tmp_path: Path, texts: list[str]) ->
     assert draft["wrench"]["header"] is False
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases(1)
 @pytest.mark.parametrize(
     ("sign", "push"),
@@ -609,6 +612,7 @@ def test_four_joint_angles_are_no_quaternion(tmp_path: Path) -> None:
     assert list(draft) == ["wrench"]
 
 
+@pytest.mark.slow
 def test_a_robot_learning_table_is_drafted(tmp_path: Path) -> None:
     frame = table()
     pose = frame.select(*POSITION, "q1", "q2", "q3", "q0").to_numpy()
@@ -652,6 +656,7 @@ def test_a_short_table_without_time_has_poses_at_rest(tmp_path: Path) -> None:
     assert draft["static"]["orientation"]["columns"] == ["qw", "qx", "qy", "qz"]
 
 
+@pytest.mark.slow
 def test_offsets_are_from_free_motion_or_the_load_file(tmp_path: Path) -> None:
     path = described(tmp_path, table())
     load = identify_log(path).identification
@@ -677,6 +682,7 @@ def test_offsets_are_from_free_motion_or_the_load_file(tmp_path: Path) -> None:
         eliminate_log(path, load, untouched_s=(0.2, 0.9), tare=False)
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases(1)
 @pytest.mark.parametrize("stride", [2, 4, 8])
 def test_arrays_of_different_length_in_a_file_have_rates(tmp_path: Path, stride: int) -> None:
@@ -697,6 +703,7 @@ def test_arrays_of_different_length_in_a_file_have_rates(tmp_path: Path, stride:
     assert summary["findings"] == []
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases(2)
 @pytest.mark.parametrize(("unit", "scale"), [("us", 100.0), ("us", 1e3), ("ms", 0.01), ("s", 2e-3)])
 def test_times_in_ticks_are_inspected_and_read(tmp_path: Path, unit: str, scale: float) -> None:

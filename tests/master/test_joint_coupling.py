@@ -62,7 +62,7 @@ def run(scenario):
     return simulate(station, scenario.simulation, progress=False)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_each_slave_joint_follows_its_leader_joint(scenario):
     move = Sine(duration=1.0, ramp=0.02, frequency=4.0, translation=[0.03, 0.02, 0.03],
                 rotation=[0.2, -0.1, 0.3])  # fmt: skip
@@ -77,6 +77,7 @@ def test_each_slave_joint_follows_its_leader_joint(scenario):
     np.testing.assert_allclose(moved, SCALE * hand, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_rendered_load_is_scaled_by_sigma_in_tool_axes(scenario):
     """J^T of the leader equals that of the slave except for its size."""
     result = run(scenario)

@@ -226,7 +226,7 @@ def test_quaternion_of_the_grip_is_continuous_over_two_turns(joint):
     np.testing.assert_allclose(pose, device.forward_kinematics(device.home), atol=1e-12)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_inverse_kinematics_and_matrices_are_consistent():
     device = leader()
     q = device.home + 0.1

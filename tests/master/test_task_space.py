@@ -168,6 +168,7 @@ def test_file_selects_device_and_overrides_figures():
     assert PhantomJointFriction() == Master().friction
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases(1)
 @pytest.mark.parametrize("model", ["geomagic_touch", "omega_6"])
 def test_station_force_is_within_the_device_limits(model):

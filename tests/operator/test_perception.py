@@ -58,7 +58,7 @@ def is_perceived(mass: float, steady: float, push: float, amplitude: float = 0.0
     return felt[:, CONTACT_NOTICED_INDEX] > 0.0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(steady=st.floats(0.0, 8.0))
 def test_push_is_detected_above_the_just_noticeable_difference(steady):
@@ -72,6 +72,7 @@ def test_push_is_detected_above_the_just_noticeable_difference(steady):
     assert not is_perceived(0.0, steady, 0.9 * least).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("push", [0.1, 0.3])
 def test_inertial_force_masks_a_contact(push):
     """1.2 kg at 8.9 m/s^2 give 10.7 N; a push of 0.3 N is below a tenth of it."""

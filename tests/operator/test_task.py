@@ -81,6 +81,7 @@ def reach():
     return run("reach")
 
 
+@pytest.mark.slow
 def test_reaching_ends_in_the_target(reach):
     result, measures = reach
     assert measures["success"] == 1.0
@@ -91,7 +92,6 @@ def test_reaching_ends_in_the_target(reach):
     assert np.isnan(measures["detection_time_s"]) and measures["contact_force_overshoot_N"] == 0.0
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_smaller_target_takes_longer():
     """Fitts' law: motor noise requires corrections."""
@@ -161,7 +161,7 @@ def test_submovement_respects_acceleration_and_minimum_duration(monkeypatch, len
     assert took == duration if duration else peak == pytest.approx(2.0, rel=1e-6)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_run_depends_only_on_the_seed(reach):
     again, _ = run("reach")
     other, _ = run("reach", simulation__seed=5)
@@ -169,7 +169,6 @@ def test_run_depends_only_on_the_seed(reach):
     assert not np.array_equal(other["hand_wrench_E"], reach[0]["hand_wrench_E"])
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_vision_has_the_delay_of_the_network():
     """One movement reaches a large target; the operator sees it after both delays."""
@@ -180,7 +179,6 @@ def test_vision_has_the_delay_of_the_network():
     assert far - near == pytest.approx(2 * 0.15, abs=0.02)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(("there", "back"), [(0.03, 0.22), (0.22, 0.03)])
 def test_unequal_delays_add_to_one_round_trip(there, back):
@@ -221,7 +219,6 @@ def test_rendered_weight_raises_threshold_and_slows_approach(touch):
     assert limit[1] == pytest.approx(0.1 * 3.13 * 9.81 / 17.5, rel=0.1)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_search_finds_the_slot_after_an_aim_error():
     """The chamfers are 4 mm wide; a larger aim error lands beside them."""
@@ -233,7 +230,6 @@ def test_search_finds_the_slot_after_an_aim_error():
     assert measures["detection_time_s"] < 0.5
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_operator_gives_up_without_contact():
     result, measures = run("touch", force_scaling__gamma=0.0, sheet_spring=None)
@@ -242,7 +238,6 @@ def test_operator_gives_up_without_contact():
     assert result["task_state"][-1, OUTCOME_INDEX] <= 0.0
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_set_force_is_held():
     """Device friction, which hides 1 N at the tool, is zero."""
@@ -254,6 +249,7 @@ def test_set_force_is_held():
     assert measures["press_error_N"] < (0.1 + 2 * 0.1) * 12.0
 
 
+@pytest.mark.slow
 def test_press_is_given_up_after_timeout():
     task = Press(translation=[0.0, 0.0, -0.08], timeout=1.0)
     result, measures = run("press", **with_task(task, simulation__duration=1.5))
@@ -261,7 +257,7 @@ def test_press_is_given_up_after_timeout():
     assert result["task_state"][-1, OUTCOME_INDEX] == -1.0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_papers_contact_is_detected_without_false_detection():
     """Fig. 8 without inertia: the touch of 50 ms is detected, the fast motion before is not."""
     scenario = LoadScenario("contact_transition")

@@ -39,7 +39,7 @@ def test_policy_allows_connections_only_to_the_given_server():
     ) and "'self'" not in content_security_policy("")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_replays_and_reports_have_a_policy(tmp_path):
     film = ReplayFile("x", np.arange(2.0), 1.0)
     film.write(tmp_path / "x.html", lambda meshcat: lambda time, frame: None)

@@ -147,7 +147,6 @@ def rough_networks(tmp_path_factory) -> list[tuple[NetworkConfig, NetworkConfig]
     return list(zip(lines[::2], lines[1::2], strict=True))
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_station_recovers_after_every_rough_network(rough_networks, method):
@@ -164,7 +163,6 @@ def test_station_recovers_after_every_rough_network(rough_networks, method):
         assert np.abs(result.hand_force[-1000:]).max() < 0.1
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_wrench_rises_without_steps_while_resuming(rough_networks, method):

@@ -105,7 +105,6 @@ def test_figure_without_contact_has_no_contact_mark():
     assert [text.get_text() for text in lower.texts] == ["detected"]
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.pictures
 def test_picture_is_reproducible():

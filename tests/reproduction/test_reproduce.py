@@ -38,7 +38,7 @@ from drake_teleop.load.regressor import regressor_into
 from drake_teleop.station.result import Signal, SimulationResult
 from drake_teleop.station.scenario import LoadScenario, replace
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.slow
 
 FORCE_SCALE = 1 / 17.5
 

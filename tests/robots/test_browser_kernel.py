@@ -76,7 +76,7 @@ def drop(page: Page, **files: str) -> None:
 SAID = "document.querySelector('[data-part=said]').textContent"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_sample_log_has_the_numbers_of_eliminate(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     sample_log_command(Path("out/sample"), quiet=True)

@@ -90,6 +90,7 @@ class Stream:
         pass
 
 
+@pytest.mark.slow
 def test_calibration_stops_after_two_agreeing_results_and_equals_identify(tmp_path: Path) -> None:
     path = tmp_path / "log.parquet"
     recorder = Recorder()
@@ -157,6 +158,7 @@ class UselessStream(Stream):
         return self._readings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("readings", "remedy"),
     [
@@ -261,7 +263,6 @@ def test_rotation_about_one_axis_leaves_other_inertias_unknown(tmp_path: Path) -
     assert "about y" not in at.advice
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_no_parameter_is_known_after_a_change_of_load(tmp_path: Path) -> None:
     both = np.concatenate([recorded(3.0, [0, 1, 2]), recorded(3.0, [0, 1, 2], phi=1.5 * PHI)])
@@ -288,7 +289,6 @@ def test_excluded_contact_causes_no_doubt(tmp_path: Path) -> None:
     assert at.doubts == () and at.is_within_tolerance.all() and at.advice == ""
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.pictures
 def test_command_reports_the_time_of_a_tare(tmp_path: Path) -> None:
@@ -423,7 +423,6 @@ def test_a_single_result_within_the_tolerance_is_not_known(tmp_path, monkeypatch
     assert summary["known"] == {"mass": False} and not summary["all_known"]
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.pictures
 def test_exit_status_is_1_if_the_tolerance_is_not_met(tmp_path: Path) -> None:
@@ -448,6 +447,7 @@ def posed(seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return t, wrench, poses + np.repeat([2e-5, 2e-5], [4, 3]) * rng.normal(size=(len(t), 7))
 
 
+@pytest.mark.slow
 def test_poses_of_another_frame_and_clock_are_recorded_unprocessed(tmp_path: Path) -> None:
     """The stamps of the motion are 4 ms late and from another clock."""
     recorder = Recorder((WRENCH, POSE), np.full(6, 80.0), X_FS, two_clocks=True)
@@ -470,7 +470,6 @@ def test_poses_of_another_frame_and_clock_are_recorded_unprocessed(tmp_path: Pat
     assert (np.abs(error) < tolerances_in_display_units(TOLERANCE, PHI)).all()
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.skipif(find_spec("rtde_receive") is None, reason="ur_rtde has no wheel here")
 def test_calibration_with_a_ur_and_a_rotated_and_shifted_sensor(tmp_path: Path) -> None:

@@ -110,7 +110,6 @@ def release(values: Values, k: int) -> None:
     values[k:, :6] -= loaded(values, 0.5 * PHI)[k:]
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("time", [5.513, 8.0])
 @pytest.mark.parametrize(
@@ -137,7 +136,6 @@ def test_change_is_reported_once_with_time_and_size(
         assert out[-1].flags & ReadingFlag.OTHER_LOAD
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_tare_and_later_grasp_are_both_reported() -> None:
     values = stream(seconds=20.0)
@@ -148,7 +146,6 @@ def test_tare_and_later_grasp_are_both_reported() -> None:
     assert [time_of(x) for x in messages] == pytest.approx([5.0, 11.0], abs=0.02)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("push", [[1, 2, -6, 0.3, 0.1, 0], [0, 0, -4, 0.1, 0, 0]])
 def test_push_at_rest_is_not_reported(push: list[float]) -> None:
@@ -198,7 +195,6 @@ def test_kind_of_a_change_needs_rotations_after_it(
         assert changes._is_change_kind_certain(state, 5.0) == expected
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_live_stream_is_explained_by_another_process() -> None:
     values = stream()

@@ -51,6 +51,7 @@ def run_test(folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run([folder / "test"], capture_output=True, text=True)
 
 
+@pytest.mark.slow
 @needs_cc
 def test_shipped_test_passes_and_finds_a_changed_sign(exported):
     assert run_test(exported).returncode == 0

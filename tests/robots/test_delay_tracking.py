@@ -51,6 +51,7 @@ def followed(
         follower.update_delay(at, wrench, before, after)
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases(1)
 @pytest.mark.parametrize("late", [-0.006, 0.011])
 def test_delay_is_estimated_and_tracked(late: float) -> None:
@@ -61,6 +62,7 @@ def test_delay_is_estimated_and_tracked(late: float) -> None:
     assert late + 5e-4 < follower.delay_s < late + 0.003
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "samples", "late"), [(1.0, 80, 0.006), (4.0, 200, -0.01)])
 def test_delay_stays_until_it_is_certain_and_then_changes_slowly(
     noise: float, samples: int, late: float
@@ -83,6 +85,7 @@ def test_delay_is_at_most_100_ms(side: float) -> None:
     assert follower.delay_s == side * 0.1
 
 
+@pytest.mark.slow
 def test_contact_is_excluded_and_a_new_clock_restarts_the_tracking() -> None:
     follower = DelayTracker(load(), 0.001, 30.0, 0.005)
     followed(follower, 0.0, 1.0, 0.005)
@@ -106,6 +109,7 @@ def test_delay_is_constant_at_rest() -> None:
     assert follower.delay_s == 0.005
 
 
+@pytest.mark.slow
 def test_another_load_takes_over_the_delay_and_tracks_it() -> None:
     stub = StreamStub(WRENCH, POSE)
     stub.read = lambda timeout_s: None  # the stream ends at once
@@ -123,6 +127,7 @@ def test_another_load_takes_over_the_delay_and_tracks_it() -> None:
     assert fixed.delay_s == 0.002
 
 
+@pytest.mark.slow
 def test_assembly_tracks_an_unknown_delay() -> None:
     """Poses are stamped 4 ms late."""
     assembly = ReadingAssembler(

@@ -154,7 +154,6 @@ def test_options_for_joints_are_checked_together(model: Path) -> None:
         main(["compensate", "udp://:1", "--rate", "1", "--load", "x", "--sensor-frame", "tool"])
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("box", ["netft", "zenoh"])
 def test_calibration_with_a_wrench_source_and_joints(box: str, model: Path, tmp_path: Path) -> None:

@@ -106,7 +106,7 @@ def touched(count: int) -> list[Reading]:
     return [row._replace(t=0.001 * row.number) for row in (*free, *pushed[count:])]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_documented_calibrate_command_identifies_the_load(in_folder) -> None:
     rows = recorded(40.0, [0, 1, 2])
     packets = [udp.pack_reading(Reading(k, DT * k, row)) for k, row in enumerate(rows)]
@@ -118,7 +118,7 @@ def test_documented_calibrate_command_identifies_the_load(in_folder) -> None:
     assert found["mass"] == pytest.approx(PHI[0], rel=0.005)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_documented_compensate_command_eliminates_the_tool(in_folder, answers, capfd) -> None:
     with Peer([udp.pack_reading(row) for row in touched(800)], 0.001, answers) as peer:
         type_in("docs/robot.md", "drake-teleop compensate udp")

@@ -297,7 +297,6 @@ NODE = "import sys; from drake_teleop.cli.main import main; main(sys.argv[1:])"
 
 
 @ros
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("stop", "during_calibration"), [(signal.SIGINT, False), (signal.SIGTERM, True)]

@@ -257,7 +257,7 @@ for k in range(10**6):
 """
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TABLES)
 @pytest.mark.parametrize("after", [1, 57, 200])
 def test_table_contains_the_rows_before_a_kill(tmp_path: Path, name: str, after: int) -> None:

@@ -69,7 +69,7 @@ def test_push_is_flagged_while_it_lasts() -> None:
     assert (flags[1025:1250] == ReadingFlag.IN_CONTACT).all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_noise_floor_of_a_free_log_detects_small_contacts(tmp_path: Path) -> None:
     """The threshold is a third of that of the watch with gain errors of 5 %."""
     gains, free = np.array([1.05, 1.0, 0.95, 1.0, 1.05, 1.0]), tmp_path / "free.parquet"
@@ -107,6 +107,7 @@ def shaken(seed: int) -> tuple[np.ndarray, np.ndarray]:
     return t, np.hstack([wrench, *motion])
 
 
+@pytest.mark.slow
 def test_noise_floor_rises_with_acceleration(tmp_path: Path) -> None:
     """The gain error leaves 0.7 N at 8 m/s^2, no contact; half of it at rest is contact."""
     free = tmp_path / "free.parquet"

@@ -259,6 +259,7 @@ def test_total_delay_is_the_sum_of_delays():
     )
 
 
+@pytest.mark.slow
 def test_6_ms_mismatch_is_worse_than_no_inertia_above_28_hz(fast):
     """The residual is 2 sin(pi f tau) of the inertial wrench: all of it at f = 1 / (6 tau)."""
     late = dataclasses.replace(QUIET, acceleration_latency=6e-3)
@@ -322,6 +323,7 @@ def test_with_little_drift_the_poles_are_those_of_a_second_order_butterworth():
     assert gains[1] == pytest.approx(crossover**2 * T, rel=0.05)
 
 
+@pytest.mark.slow
 def test_filter_errors_equal_the_predicted_deviations():
     position_std, white, walk, steps = 7e-6, 1.5, 3.0, 60000
     gains = steady_state_kalman_gains(position_std, white, walk, T)
@@ -358,6 +360,7 @@ def left(fast: Array, sensor: WristSensorConfig, source: str) -> tuple[float, fl
     return rms(force), float(np.linalg.norm(force, axis=1).max())
 
 
+@pytest.mark.slow
 def test_fused_corrects_a_wrong_accelerometer_without_loss(fast):
     sensor = without_parts(JR3, "drift")
     assert np.linalg.norm(fast[SETTLED:, :3], axis=1).max() == pytest.approx(97.0, abs=3.0)

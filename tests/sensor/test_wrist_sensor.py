@@ -69,6 +69,7 @@ def test_the_low_pass_is_a_fourth_order_butterworth(rate):
         assert abs(response(cutoff, rate, frequency)) == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_reading_at_rest_is_weight_plus_offset():
     offset = [6.0, -3.0, 8.0, 0.3, -0.4, 0.1]
     result = at_rest(dataclasses.replace(QUIET, offset=offset))
@@ -81,6 +82,7 @@ def test_reading_at_rest_is_weight_plus_offset():
     np.testing.assert_allclose(result["specific_force_S"][-1], weight, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_filtered_noise_has_the_variance_of_white_noise_through_the_filter():
     config = dataclasses.replace(QUIET, force_noise=0.25, angular_acceleration_noise=1.5)
     result = at_rest(config)
@@ -92,7 +94,6 @@ def test_the_filtered_noise_has_the_variance_of_white_noise_through_the_filter()
     assert result["specific_force_S"].std(axis=0).max() < 1e-6
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_channels_are_independent_and_other_seeds_give_other_noise():
     config = dataclasses.replace(QUIET, force_noise=0.25, torque_noise=0.01)
@@ -113,7 +114,6 @@ def test_converter_quantises_before_the_filter():
     assert result["measured_wrench_S"][-1, 2] != pytest.approx(-3.13 * 9.81, abs=1e-3)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_a_saturated_sample_is_clipped_and_flagged():
     result = at_rest(dataclasses.replace(QUIET, force_range=[200.0, 200.0, 25.0]))
@@ -122,7 +122,6 @@ def test_a_saturated_sample_is_clipped_and_flagged():
     assert (at_rest(QUIET)["saturated"] == 0.0).all()
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_angular_velocity_comes_from_the_encoders_with_their_resolution():
     rough = at_rest(dataclasses.replace(QUIET, encoder_resolution=1e-3))
@@ -146,6 +145,7 @@ def swinging(rate: float) -> SimulationResult:
     return simulate(MakeIdentificationStation(scenario, trajectory), scenario.simulation)
 
 
+@pytest.mark.slow
 def test_sample_time_is_the_instant_of_the_sample():
     """Reaction force, motion and joint angles at `sample_time`, not at t, equal the sample."""
     result = swinging(8000.0)

@@ -68,7 +68,7 @@ def scenario(folder):
     return LoadScenario(folder / "station.yaml")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_wrench_is_reaction_of_sensor_weld(scenario):
     scenario = replace(scenario, wrist_sensor__ideal=True)
     station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
@@ -95,6 +95,7 @@ def test_wrench_is_reaction_of_sensor_weld(scenario):
     assert np.abs(sample).max() > 5.0
 
 
+@pytest.mark.slow
 def test_log_has_one_component_per_joint(scenario):
     station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
     result = simulate(station, scenario.simulation, progress=False)
@@ -504,7 +505,6 @@ def test_redundant_arm_approaches_posture_at_pull_rate(scenario, free):
     assert free[1] < 0.9990
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_untouched_surroundings_change_no_multiplier(scenario, free):
     """The command displacement exceeds the tolerance of the kinematics in both cases."""

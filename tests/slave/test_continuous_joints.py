@@ -273,7 +273,7 @@ def test_leader_has_no_stops_at_endless_joints(tmp_path):
     assert device.is_any_axis_at_end_stop(q[np.newaxis]).all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_summary_of_a_run_and_frame_of_a_page_are_plain_json(tmp_path):
     (tmp_path / "arm.urdf").write_text(urdf(SEVEN))
     scenario = tmp_path / "station.yaml"

@@ -65,7 +65,6 @@ def all_ik_solutions(R, p):
     return angle_difference(q)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_all_eight_branches_meet_random_poses(arm):
     rng = np.random.default_rng(0)

@@ -68,7 +68,6 @@ def test_sensor_wrench_includes_payload():
     assert sizes[0] == pytest.approx(5.13 * 9.81, rel=0.01)  # not yet
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_identification_includes_payload():
     scenario = identification_scenario(replace(Scenario(), slave__payload=HELD), 1)

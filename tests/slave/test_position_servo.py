@@ -52,7 +52,7 @@ def follow(arm, interface, command, steps):
     return np.array(states), np.array(torques)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_lag_is_lookahead_plus_dead_time_plus_half_a_period(arm):
     speed = np.array([0.2, -0.1, 0.15, 0.1, -0.2, 0.3])
     states, _ = follow(arm, UR, lambda t: HOME + speed * t, 2400)
@@ -61,6 +61,7 @@ def test_lag_is_lookahead_plus_dead_time_plus_half_a_period(arm):
     np.testing.assert_allclose(late, expected, atol=1.5 * PERIOD)
 
 
+@pytest.mark.slow
 def test_step_response_equals_closed_form_after_dead_time(arm):
     """Solution of d2r/dt2 = k (1 - r - lookahead dr/dt), damping ratio 0.87."""
     states, _ = follow(arm, UR, lambda t: HOME + 0.02, 800)

@@ -52,7 +52,7 @@ def positions_after_step(samples, hz, wall=None):
     return slave.plant.GetPositions(context, slave.instance)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     # The second pushes the tool, which is 3 mm in it, with 60 N.
     ("wall", "share"),
@@ -77,6 +77,7 @@ class DisplacedMaster(LeafSystem):
         )
 
 
+@pytest.mark.slow
 def test_sensor_uses_torque_line_inside_step():
     scenario = replace(
         LoadScenario("free_motion_force"),

@@ -35,6 +35,7 @@ def true_effects_with_a_corner_missing() -> list[np.ndarray]:
     return [x + 3 * (0.7 - 0.5) * middles, y + 3 * (0.3 - 0.5) * middles, z]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("corner", [False, True])
 @pytest.mark.parametrize(("noise", "seeds"), [(0.0, 1), (0.5, 3)])
 def test_all_effects_are_in_their_intervals_in_nine_of_ten_sobol_designs(noise, seeds, corner):

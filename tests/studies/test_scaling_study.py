@@ -125,7 +125,6 @@ def test_shipped_studies_share_their_scales():
     assert scales[3] == scales[0][:1]
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.pictures
 def test_scaling_study_command_writes_its_answer(tmp_path, monkeypatch):

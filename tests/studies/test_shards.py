@@ -81,7 +81,6 @@ for number, last in json.loads(sys.argv[2]):
 """
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_killed_shards_in_any_order_give_the_bytes_of_one_process(tmp_path, whole):
     """Three of eight shards are killed at a random run and submitted again at the end."""
@@ -97,6 +96,7 @@ def test_killed_shards_in_any_order_give_the_bytes_of_one_process(tmp_path, whol
     assert rows.equals(run(out, function=pytest.fail)), "nothing remains to be run"
 
 
+@pytest.mark.slow
 def test_merge_names_the_shards_that_are_missing(tmp_path, whole):
     for number in (1, 2, 4):
         run(tmp_path / "out", shard=f"{number}/5")
@@ -168,6 +168,7 @@ def test_any_executor_gives_the_same_bytes(tmp_path, whole, kind):
     assert table(tmp_path / "out") == whole
 
 
+@pytest.mark.slow
 def test_executor_that_ends_is_an_error_and_finished_runs_are_kept(tmp_path, whole):
     class Ending(ThreadPoolExecutor):
         submitted = 0
@@ -196,7 +197,6 @@ main([sys.argv[1], "--no-nanny", "--nthreads", "1", "--host", "127.0.0.1",
 """
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [False, True])
 def test_dask_worker_of_another_version_is_refused_by_name(tmp_path, late, monkeypatch):

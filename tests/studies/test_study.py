@@ -140,7 +140,6 @@ def two_runs(monkeypatch):
     monkeypatch.setattr(studies, "study_command", in_one_process)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.pictures
 def test_commands_and_code_of_the_docs_run(two_runs, tmp_path, monkeypatch):
@@ -194,7 +193,6 @@ def test_table_has_a_row_for_each_run(serial):
     assert np.all(np.diff(mean.sort("force_scaling.sigma")["rms_force_to_master_N"]) > 0.1)
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_processes_give_the_same_bytes(serial, files):
     out = files / "parallel"
@@ -204,7 +202,6 @@ def test_processes_give_the_same_bytes(serial, files):
     assert not (out / "running").exists(), "nothing is under way any more"
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_local_dask_cluster_gives_the_same_bytes(serial, files, monkeypatch):
     out, write, seen = files / "dask", Store.write, set()
@@ -243,7 +240,6 @@ def test_stopped_study_of_stations_continues(serial, files, monkeypatch):
     assert parts(out) == parts(serial[1])
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_kills_neither_lose_nor_duplicate_rows(tmp_path):
     names = ("fake.py", "killed", "whole", "kept.json")
@@ -383,7 +379,6 @@ def fatal_run(own: int, at: float):
     return work
 
 
-@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("cluster", [None, "local"])
 def test_run_that_ends_its_process_is_a_row_with_an_error(tmp_path, cluster):
@@ -428,7 +423,6 @@ run_study(Study(factors=[Factor("a.b", values=[1.0, 2.0])]), out / "out", work, 
 """
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_processes_end_with_a_study_that_is_killed(tmp_path):
     script = tmp_path / "orphans.py"
@@ -520,7 +514,6 @@ def test_an_adaptive_design_finds_the_best_point(searched):
     assert len(rows.select("a.x", "a.w").unique()) == 40
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_adaptive_design_continues_after_any_stop(tmp_path, searched):
     calls = []
@@ -710,6 +703,7 @@ repeats: 200
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("factors", "runs"),
     [(2, "1,000,000,000,000 runs"), (5, "10^21.0 runs"), (110, "10^336.0 runs")],

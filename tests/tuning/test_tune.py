@@ -474,7 +474,7 @@ def test_settings_change_method_scales_and_filter_alone():
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_tuned_scenario_is_written_and_an_interrupted_search_continues(tmp_path, monkeypatch):
     monkeypatch.setattr(search, "CANDIDATE_METHODS", ("ledger", "wave"))
     monkeypatch.setattr(search, "CANDIDATE_SIGMAS", (0.0,))
