@@ -23,19 +23,21 @@ class SheetSpring(environment.Environment):
     """Settings of the sheet spring: position, size and material of its leaf."""
 
     position: list[float] = quantity(
-        [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WLeaf, unloaded leaf's top, 25 mm from its free end"
+        [0.55, 0.0, 0.15], "m", -2.0, 2.0, "point on leaf's upper face at rest, 25 mm from its end"
     )
     length: float = quantity(0.170, "m", 0.02, 1.0, "free length of the leaf")
     width: float = quantity(
-        0.060, "m", 0.005, 0.5, "width of the section; the touched face remains 170 x 60 mm"
+        0.060, "m", 0.005, 0.5, "leaf width, for stiffness and mass; contact face: 170 x 60 mm"
     )
-    thickness: float = quantity(0.002, "m", 0.0002, 0.02, "thickness of the section")
+    thickness: float = quantity(0.002, "m", 0.0002, 0.02, "thickness of the leaf")
     youngs_modulus: float = quantity(210e9, "Pa", 1e9, 500e9, "Young's modulus, spring steel")
     density: float = quantity(7850.0, "kg/m^3", 500.0, 20000.0, "density, spring steel")
     damping_ratio: float = quantity(
-        0.03, "1", 0.0, 100.0, "damping ratio of the first mode; above 1 the leaf creeps back"
+        0.03, "1", 0.0, 100.0, "damping ratio of the first bending mode; above 1: overdamped"
     )
-    slip_speed: float = quantity(1e-4, "m/s", 1e-6, 1.0, "friction is full above this speed (E)")
+    slip_speed: float = quantity(
+        1e-4, "m/s", 1e-6, 1.0, "sliding speed from which friction has its full value (estimate)"
+    )
 
     @property
     def stiffness(self) -> float:

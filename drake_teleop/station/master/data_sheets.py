@@ -49,18 +49,18 @@ class DeviceFigures:
     turning_damping: float = quantity(5e-5, "N m s/rad", 0.0, 1.0, "viscous damping of rotation")
     peak_force: float = quantity(10.0, "N", 0.0, 500.0, "largest displayed force")
     peak_torque: list[float] = quantity(
-        [0.0, 0.0, 0.0], "N m", 0.0, 50.0, "largest torque about yaw, pitch, roll; one 0: no torque"
+        [0.0, 0.0, 0.0], "N m", 0.0, 50.0, "peak torque of yaw, pitch, roll; any at 0: no torque"
     )
     size: list[float] = quantity([0.15, 0.15, 0.15], "m", 1e-3, 2.0, "workspace along x, y, z")
     centre: list[float] = quantity(
-        [0.27, 0.0, 0.03], "m", -2.0, 2.0, "workspace centre, p_B; default: start of the scenarios"
+        [0.27, 0.0, 0.03], "m", -2.0, 2.0, "p_B of the workspace's middle; default: at the start"
     )
     turn: list[float] = quantity(
-        [1.2, 1.2, 2.4], "rad", 0.0, math.pi, "largest yaw, pitch (to 1.5), roll; both directions"
+        [1.2, 1.2, 2.4], "rad", 0.0, math.pi, "limits +- of yaw, pitch (at most 1.5), and roll"
     )
-    resolution: float = quantity(0.0, "m", 0.0, 0.01, "position step of the encoders; 0: exact")
-    turn_resolution: float = quantity(0.0, "rad", 0.0, 0.1, "rotation step of encoders; 0: exact")
-    rate_hz: float = quantity(0.0, "Hz", 0.0, 1e5, "update rate; 0 or over hand_hz: rates.hand_hz")
+    resolution: float = quantity(0.0, "m", 0.0, 0.01, "position step of the stylus; 0: exact")
+    turn_resolution: float = quantity(0.0, "rad", 0.0, 0.1, "rotation step of stylus; 0: exact")
+    rate_hz: float = quantity(0.0, "Hz", 0.0, 1e5, "update rate; 0: as rates.hand_hz, the maximum")
 
 
 _WRIST_TURN_RAD, _NO_TURN_RAD = DeviceFigures().turn, [0.0, 0.0, 0.0]
@@ -109,14 +109,14 @@ class Master:
 
     model: str = choice(
         PHANTOM_NAME, (PHANTOM_NAME, "custom", LEADER_NAME),
-        "device; custom: defined by `figures`; leader: arm from a file", FIGURES,
+        "haptic device; custom: defined by `figures`; leader: by `leader`", FIGURES,
     )  # fmt: skip
     position: list[float] = quantity(
-        [0.27, 0.0, 0.03], "m", -0.5, 0.5, "p_BE at the start, in the device's base frame"
+        [0.27, 0.0, 0.03], "m", -0.5, 0.5, "p_BE of the stylus at the start, in the base frame B"
     )
     friction: PhantomJointFriction = field(default_factory=PhantomJointFriction)
     figures: DeviceFigures | None = plain(
-        None, "values that replace values of the device's data sheet; null: none replaced"
+        None, "data sheet that replaces that of `model`; null: not replaced"
     )
     leader: Leader | None = None
 

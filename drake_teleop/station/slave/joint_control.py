@@ -35,13 +35,13 @@ class PositionInterface:
     """Settings of an arm's interface for position commands; prismatic joints have m, not rad."""
 
     command_hz: float = quantity(500.0, "Hz", 1.0, 1e4, "rate of the commands")
-    dead_time: float = quantity(0.004, "s", 0.0, 1.0, "dead time, rounded to periods of command_hz")
+    dead_time: float = quantity(0.004, "s", 0.0, 1.0, "command delay; multiple of 1 / command_hz")
     acceleration_per_error: float = quantity(300.0, "1/s^2", 1.0, 1e7, "acceleration per error")
-    lookahead: float = quantity(0.1, "s", 1e-4, 2.0, "delay behind a command of constant speed")
+    lookahead: float = quantity(0.1, "s", 1e-4, 2.0, "lag behind a command of constant speed")
     max_speed: float = quantity(
-        math.pi, "rad/s", 1e-3, 100.0, "speed limit, unless the model's (or assumed) one is lower"
+        math.pi, "rad/s", 1e-3, 100.0, "joint speed limit, unless that of the model is lower"
     )
-    max_acceleration: float = quantity(40.0, "rad/s^2", 1e-2, 1e4, "acceleration limit, likewise")
+    max_acceleration: float = quantity(40.0, "rad/s^2", 1e-2, 1e4, "limit of joint acceleration")
     drive_bandwidth_hz: float = quantity(30.0, "Hz", 0.1, 1e3, "drives' bandwidth; sets stiffness")
 
     def check(self, where: str, rate: float) -> None:
@@ -86,16 +86,16 @@ POSITION_INTERFACE_PRESETS = Presets(_position_interfaces)
 class JointControlConfig:
     """Settings of the slave's joint control: computed torque or a position interface."""
 
-    position_bandwidth_hz: float = quantity(12.0, "Hz", 0.1, 1e4, "position loop bandwidth (E)")
-    velocity_bandwidth_hz: float = quantity(70.0, "Hz", 0.1, 1e4, "velocity loop bandwidth (E)")
+    position_bandwidth_hz: float = quantity(12.0, "Hz", 0.1, 1e4, "position bandwidth (estimate)")
+    velocity_bandwidth_hz: float = quantity(70.0, "Hz", 0.1, 1e4, "velocity bandwidth (estimate)")
     servo: str = choice(
         COMPUTED_TORQUE_SERVO_NAME,
         (COMPUTED_TORQUE_SERVO_NAME, *POSITION_INTERFACE_PRESETS, "position"),
-        "computed_torque: uses the bandwidths above; position: interface with the fields of"
-        " `interface`; others: position interfaces of arms",
+        "computed_torque: with position_bandwidth_hz and velocity_bandwidth_hz; position: position"
+        " interface with the settings `interface`; others: presets for arms",
     )
     interface: PositionInterface | None = plain(
-        None, "position interface that replaces that of the servo; null: the servo's"
+        None, "settings of the position interface; null: those of the preset `servo`"
     )
 
     @property

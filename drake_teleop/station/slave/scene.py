@@ -26,16 +26,18 @@ class Scene(Environment):
     """Surroundings from a file, with pose, and point or hydroelastic contact."""
 
     file: str = plain(
-        "door.sdf", ".sdf, .urdf, .dmd.yaml, from the scenario's folder, or door.sdf", is_path=True
+        "door.sdf", "SDF, URDF, .dmd.yaml in scenario's folder; built in: door.sdf", is_path=True
     )
     position: list[float] = quantity([0.0, 0.0, 0.0], "m", -3.0, 3.0, "the file's position in W")
     rotation: list[float] = quantity([0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch, yaw in W")
-    fixed: bool = plain(True, "weld free roots at their poses in the file; false: they float")
+    fixed: bool = plain(True, "weld free bodies at their poses in the file; false: they float")
     contact: str = choice(
-        "point", ("point", "hydroelastic"), "Drake's model; non-hydroelastic shapes use point"
+        "point", ("point", "hydroelastic"), "contact model; shapes without hydroelastic data: point"
     )
-    tool_modulus: float = quantity(1e7, "Pa", 1e4, 1e11, "hydroelastic modulus of the tool (E)")
-    slip_speed: float = quantity(1e-3, "m/s", 1e-6, 1.0, "sliding speed of full friction (E)")
+    tool_modulus: float = quantity(1e7, "Pa", 1e4, 1e11, "hydroelastic tool modulus (estimate)")
+    slip_speed: float = quantity(
+        1e-3, "m/s", 1e-6, 1.0, "sliding speed from which friction has its full value (estimate)"
+    )
 
     @property
     def path(self) -> Path:
