@@ -133,7 +133,8 @@ def MakeSlaveSide(
     if scenario.contact_detection is not None:
         if noise_floor is None:
             remedy = "pass noise_floor=identify_load(...).noise_floor"
-            raise DrakeTeleopError("no noise floor given", where="contact_detection", remedy=remedy)
+            what = "contact detection requires a noise floor"
+            raise DrakeTeleopError(what, where="contact_detection", remedy=remedy)
         expect_type(NoiseFloor, noise_floor, "noise_floor", "pass that of identify_load")
         period = 1 / scenario.rates.estimator_hz
         detection = ContactDetection(scenario.contact_detection, noise_floor, arm, period)
@@ -148,14 +149,14 @@ def _is_torque_controller(controller: System | None, scenario: Scenario) -> bool
         return False
     expect_type(System, controller, "controller", "make a Drake system: docs/station.md")
     torques: bool = controller.HasOutputPort("joint_torque")
-    missing = ""
+    what = ""
     if not controller.HasInputPort("pose_command"):
-        missing = "input port 'pose_command'"
+        what = "the custom controller has no input port 'pose_command'"
     elif not (torques or controller.HasOutputPort("pose_command")):
-        missing = "output port 'joint_torque' or 'pose_command'"
-    if missing:
+        what = "the custom controller has no output port 'joint_torque' or 'pose_command'"
+    if what:
         remedy = "docs/station.md lists its ports"
-        raise DrakeTeleopError(f"the block has no {missing}", where="controller", remedy=remedy)
+        raise DrakeTeleopError(what, where="controller", remedy=remedy)
     scenario.master.check_pose_mode("a custom controller")
     return torques
 

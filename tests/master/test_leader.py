@@ -271,8 +271,8 @@ def test_station_ports_and_file_path_relative_to_scenario(tmp_path):
         ),
         (
             dataclasses.replace(LEADER, package_paths=["none"]),
-            "no folder none for its packages; correct --package-path, or package_paths in slave or"
-            " master.leader",
+            "the package folder none does not exist; correct --package-path, or package_paths in"
+            " slave or master.leader",
         ),
         (dataclasses.replace(LEADER, friction=[1.0]), "the friction stops the haptic device"),
     ],

@@ -314,7 +314,7 @@ def test_arm_without_visuals_is_shown_as_sticks(scenario):
         ({"torque_limits": {"knee": 5.0}}, "the arm has no joint 'knee'; name one of j1, j2"),
         ({"torque_limits": {"j4": 0.0}}, "torque_limits.j4: 0 N m, N is outside 1e-06 to inf"),
         ({"sensor_frame": "finger"}, "no body with a mass is attached to finger"),
-        ({"model": "absent.urdf"}, "absent.urdf: there is no such file"),
+        ({"model": "absent.urdf"}, "absent.urdf: file does not exist"),
         ({"tool": Tool(model="a.sdf", mass=1.0)}, "tool.mass: a model file and a mass both define"),
         ({"tool": Tool(shapes=[Ball()])}, "require a mass"),
         ({"tool": Tool(mass=1.0, inertia=[1, 0, 0, 1, 0, 3])}, "the inertia is impossible"),

@@ -115,7 +115,7 @@ LOOKALIKES = {
     "arm with plugins, a loose cup and a floating base": (
         arm(l0=link("world", "") + link("l0") + joint(30, "floating", "", "world", "l0"),
             beyond=link("cup") + '<gazebo reference="l3"><kp>1</kp></gazebo><sensor/>'),
-        "^welded to the world, where it may float: l0; .* and left out: cup$"),
+        "^welded to the world instead of floating: l0; .* and left out: cup$"),
 }  # fmt: skip
 
 
@@ -359,7 +359,7 @@ def test_arm_is_taken_out_of_an_sdf(tmp_path, text, stated):
     assert stated in said
     assert "replaced by the nearest possible one" in said and "of link l1 (11.1 %)" in said
     assert "an impossible inertia left out, as no joint of the arm moves the link, of base" in said
-    assert "an inertia without a mass left out of hand" in said
+    assert "inertia is left out, because the mass is 0, of link hand" in said
     assert (model.lower[0], model.upper[0], model.effort_limit[0]) == (-1.0, 2.0, 30.0)
     assert plant.GetBodyByName("hand").default_mass() == 0.0
     X_BaseL1 = RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), [0, 0, 0.2])
@@ -375,7 +375,7 @@ def test_sdf_joint_with_the_name_of_a_link_gets_another(tmp_path, name):
     text = ARM_SDF.replace('<joint name="a"', f'<joint name="{name}"')
     path = written(tmp_path, f"<sdf version='1.7'>{text}</sdf>", "arm.sdf")
     _, model, said = read(path, "ft", shapes=True)
-    assert f"a new name for the joint {name} ({name}_1)" in said
+    assert f"a unique name for joint {name} ({name}_1)" in said
     assert model.joint_names == (f"{name}_1",) and model.effort_limit[0] == 30.0
 
 
@@ -513,7 +513,7 @@ def test_all_faults_are_listed_at_once(tmp_path):
 @pytest.mark.parametrize("origin", ['xyz="0 0.25"', 'xyz="0 0 a"', 'rpy="0 0 0 0"', 'xyz="${x}"'])
 def test_invalid_origin_of_the_chain_names_its_joint(tmp_path, origin):
     path = written(tmp_path, arm(j3=joint(3).replace('xyz="0 0 0.25"', origin)))
-    with pytest.raises(DrakeTeleopError, match=r"joint j3: origin \w+='.*' is no list of three"):
+    with pytest.raises(DrakeTeleopError, match=r"joint j3: \w+ of origin is '.*', not three"):
         read(path)
 
 

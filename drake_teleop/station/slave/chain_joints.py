@@ -160,7 +160,7 @@ def weld_held_joints(
         lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
         if lower < upper and not lower <= position <= upper:
             what = f"{name} at {position:g} is outside its limits, {lower:g} to {upper:g}"
-            raise DrakeTeleopError(what, where="slave.hold", remedy="check the value and its unit")
+            raise DrakeTeleopError(what, where="slave.hold", remedy="check its value and unit")
         joint.set_default_positions(np.array([position]))
         _replace_joint_by_weld(plant, joint)
     return [f"held at {position:g}: {name}" for name, position in hold.items()]

@@ -41,7 +41,7 @@ def repair_and_parse_model(
     plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...], purpose: ModelPurpose
 ) -> tuple[list[ModelInstanceIndex], ModelRepair]:
     if not os.path.isfile(path):
-        raise DrakeTeleopError("there is no such file", where=str(path), remedy="correct the path")
+        raise DrakeTeleopError("file does not exist", where=str(path), remedy="correct the path")
     kind = path.suffix.lower()
     if kind == ".xacro":
         raise DrakeTeleopError(_XACRO_FAULT, where=str(path), remedy=XACRO_REMEDY)
@@ -198,12 +198,12 @@ def ParseScene(plant: MultibodyPlant, path: Path) -> list[str]:
     """
     instances, model = repair_and_parse_model(plant, path, (), ModelPurpose(is_scene=True))
     for name, what in model.dependence_reasons.items():
-        remedy = "remove this dependence; surroundings need independent joints and links"
+        remedy = "make it independent, as all joints and links of surroundings must be"
         raise DrakeTeleopError(f"{name} {what}", where=str(path), remedy=remedy)
     for joint in (plant.get_joint(k) for each in instances for k in plant.GetJointIndices(each)):
         limits = *joint.position_lower_limits(), *joint.position_upper_limits()
         if any(abs(limit) < chain_joints.MAX_PLAUSIBLE_LIMIT_RAD_OR_M for limit in limits):
-            model.add_assumption("no position limits, which the model has, of", joint.name())
+            model.add_assumption("no effect of the position limits in the file on", joint.name())
     return model.assumptions
 
 

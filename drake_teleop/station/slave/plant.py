@@ -214,7 +214,7 @@ class ParsedSlave(NamedTuple):
         arm_from_plant.check_arm_lengths(arm, str(self.slave.path))
         arm, assumed = arm_from_plant.fill_missing_joint_limits(arm, str(self.slave.path))
         if arm.num_joints < 6:
-            assumed.append(f"with {arm.num_joints} joints the tool follows only part of the pose")
+            assumed.append(f"the tool follows part of the pose, as it has {arm.num_joints} joints")
         return arm, assumed
 
 
@@ -235,7 +235,7 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
         assumptions += assumed
         if model_bodies:
             names = ", ".join(body.name() for body in model_bodies)
-            assumptions.append(f"bodies of the model on the sensor beside the tool: {names}")
+            assumptions.append(f"bodies of the model on the sensor are part of the load: {names}")
         holder = on_sensor.body_frame()
     else:
         on_sensor, holder = model_bodies[0] if model_bodies else frame.body(), frame

@@ -221,8 +221,8 @@ def overlap_warnings(shapes: PostureShapes, *, slave_only: bool = False) -> list
         remedy = "give another start in slave.home, or correct the shapes of the model"
         if with_surroundings:
             remedy = "move the object in environment, or give another start in slave.home"
-        what = f"{first.name()} and {second.name()} overlap by {-1e3 * distance:.1f} mm"
-        found.append(f"{what} at the start (convex hulls of meshes count); {remedy}")
+        what, depth = f"{first.name()} and {second.name()}", f"{-1e3 * distance:.1f} mm"
+        found.append(f"{what} overlap by {depth} at the start (convex hulls of meshes); {remedy}")
     return found
 
 

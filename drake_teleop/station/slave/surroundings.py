@@ -105,7 +105,7 @@ def MakeToolContactModel(
     if environment.hydroelastic:
         return contact._replace(drake_contact_reason="contact is hydroelastic")
     if contact.leaf_instance is not None and len(environment.parts) > 1:
-        return contact._replace(drake_contact_reason="the environment has more than a sheet spring")
+        return contact._replace(drake_contact_reason="the sheet spring is not the only object")
     joints, order = contact.joint_table, list[int]()
     if contact.moving_bodies:
         moving = contact.moving_bodies.values()

@@ -148,9 +148,9 @@ def check_triangle_vertices(triangles: Triangles) -> Triangles:
     if not faces.size:
         raise ValueError("a mesh has no triangles")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise ValueError("a mesh has triangles with missing vertices")
+        raise ValueError("triangles of a mesh have missing vertices")
     if not np.isfinite(vertices).all():
-        raise ValueError("a mesh has vertices that are not finite")
+        raise ValueError("vertices of a mesh are not finite")
     return triangles
 
 
@@ -208,7 +208,7 @@ def _read_obj(data: bytes) -> Triangles:
 def _read_msh(data: bytes) -> Triangles:
     n, normals, texture, count = (int(k) for k in np.frombuffer(data, "<i4", 4))
     if min(n, normals, texture, count) < 0:
-        raise ValueError("a mesh file has a negative count")
+        raise ValueError("a mesh file has a negative number of elements")
     vertices = np.frombuffer(data, "<f4", 3 * n, 16).reshape(-1, 3)
     start = 16 + 4 * (3 * n + 3 * normals + 2 * texture)
     faces = np.frombuffer(data, "<i4", 3 * count, start).reshape(-1, 3)

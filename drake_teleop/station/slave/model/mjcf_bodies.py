@@ -132,7 +132,7 @@ class BodyReader:
         kind = "free" if tag == "freejoint" else given.get("type", "hinge")
         axis = given.vector("axis", (0.0, 0.0, 1.0))
         if np.linalg.norm(axis) < MIN_DIRECTION_VECTOR_LENGTH:
-            self._mjcf.model.add_fault(f"joint {name}: its axis is 0")
+            self._mjcf.model.add_fault(f"joint {name}: axis has length 0; set a direction")
             axis = np.array([0.0, 0.0, 1.0])
         limits = given.read_range("range", "limited", autolimits=self._mjcf.autolimits)
         ref = given.number("ref", 0.0)
@@ -168,7 +168,7 @@ class BodyReader:
             self.lost.setdefault(fault, []).append((body, given))
             return
         if given.get("shellinertia") == "true":
-            self._mjcf.model.add_assumption("solid instead of hollow shapes of", body.name)
+            self._mjcf.model.add_assumption("solid shapes instead of hollow ones, of", body.name)
         body.geoms.append(Geom(kind, X_BF @ X_FG, size, given, mesh))
 
     def _read_inertial(self, body: Body, given: Attributes) -> mjcf_meshes.MassProperties:
@@ -276,7 +276,7 @@ class MjcfWriter:
             values |= {"limited": "true", "range": _format_numbers(joint.limits)}
         damping = joint.attributes.number("damping", 0.0)
         if damping < 0.0:
-            self._model.add_assumption("damping 0 in place of a negative one for", joint.name)
+            self._model.add_assumption("damping is 0, not negative, of joint", joint.name)
         values["damping"] = repr(max(damping, 0.0))
         values["armature"] = repr(max(joint.attributes.number("armature", 0.0), 0.0))
         SubElement(element, "joint", values)

@@ -77,7 +77,7 @@ class Attributes(dict[str, str]):
         if limited == "false" or (limited == "auto" and not (autolimits and lower != upper)):
             return None
         if lower > upper:
-            self._model.add_fault(f"{self.label}: {name} from {lower:g} to {upper:g} is empty")
+            self._model.add_fault(f"{self.label}: swap the ends of {name}, {lower:g} to {upper:g}")
         return lower, upper
 
 
@@ -121,7 +121,7 @@ class Mjcf:
         """Return an element's attributes, with defaults of its class, otherwise of `childclass`."""
         name = element.get("class") or childclass or _MAIN_DEFAULT_CLASS
         if name not in self._defaults:
-            self.model.add_fault(f"{label}: there is no class {name}")
+            self.model.add_fault(f"{label}: the default class {name} is undefined")
             name = _MAIN_DEFAULT_CLASS
         kind = "actuator" if element.tag in _ACTUATOR_TAGS else element.tag
         defaults = self._defaults[name].get(kind, {})
@@ -173,7 +173,7 @@ class Mjcf:
             name = child.get("file", "")
             file = self.find_file(child, name, "")
             if file is None:
-                self.model.add_fault(f"the included file {name!r} was not found")
+                self.model.add_fault(f"the included file {name!r} was not found; correct its path")
             elif file.resolve() in seen:
                 self.model.add_fault(f"{name} is included twice")
             else:

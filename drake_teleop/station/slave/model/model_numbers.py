@@ -32,7 +32,7 @@ def repair_inertia_and_detect_missing(
     mass_element = link.find("inertial/mass")
     if inertial is None or mass_element is None:
         if is_sdf:
-            model.add_assumption("1 kg, the default of SDF, for", name)
+            model.add_assumption("the mass is 1 kg, the default of SDF, of link", name)
         elif inertial is not None:
             link.remove(inertial)
         return not (is_sdf or is_fixed)
@@ -55,7 +55,7 @@ def repair_inertia_and_detect_missing(
         model.add_fault(f"link {name}: {fault}")
     else:
         if no_mass and inertia.any():
-            model.add_repair("an inertia without a mass left out of", name)
+            model.add_repair("inertia is left out, because the mass is 0, of link", name)
         nearest = np.zeros((3, 3)) if no_mass else correct_impossible_inertia(inertia, name, model)
         entries = {entry: f"{nearest[at]:.17g}" for entry, at in _INERTIA_ENTRY_INDICES.items()}
         pose = inertial.findall("pose" if is_sdf else "origin")[:1]
@@ -88,7 +88,7 @@ def correct_impossible_inertia(inertia: Array, name: str, model: ModelRepair) ->
     nearest, change = nearest_possible_inertia(inertia)
     largest_change = change * np.abs(inertia).max()
     if 0.0 < change <= _INERTIA_ROUNDING_SHARE or 0.0 < largest_change <= _INERTIA_ROUNDING_KG_M2:
-        model.add_assumption("an inertia corrected for rounding of", name)
+        model.add_assumption("rounding errors in the inertia are corrected, of link", name)
     elif change:
         what = "inertia replaced by the nearest possible one (share of its largest moment) of link"
         warning = "warning: " if change > _SUSPICIOUS_INERTIA_CHANGE_SHARE else ""
@@ -151,7 +151,7 @@ def check_lengths_and_inertias(element: Element, where: str, model: ModelRepair)
             for name, text in inner.attrib.items():
                 values = parse_numbers(text)
                 if len(values) != 3 or any(map(math.isnan, values)):
-                    model.add_fault(f"{where}: origin {name}={text!r} is no list of three numbers")
+                    model.add_fault(f"{where}: {name} of origin is {text!r}, not three numbers")
         for word in " ".join([inner.text or "", *map(str, inner.attrib.values())]).split():
             value = parse_number(word)
             if math.isnan(value) and word.lower().strip("+-") != "nan":
@@ -172,7 +172,7 @@ def repair_joint(joint: Element, links: set[str], model: ModelRepair, *, in_chai
         if not link:
             model.add_fault(f"{where} has no {end} link")
         elif link not in links and link != WORLD_NAME and "::" not in link and in_chain:
-            model.add_fault(f"{where}: its {end} link {link!r} does not exist")
+            model.add_fault(f"{where}: the {end} link {link!r} does not exist")
     check_lengths_and_inertias(joint, where, model)
     is_fixed = joint.get("type") == "fixed"
     for mimic in joint.findall("mimic") if is_fixed or is_held else ():
@@ -192,15 +192,15 @@ def _check_joint_type_mimic_and_axis(joint: Element, where: str, model: ModelRep
     if kind not in ("revolute", "continuous", "prismatic"):
         between = f" on {joint_link(joint, 'parent')}" if kind == "floating" else ""
         remedy = "up to the sensor, use joints that turn about one axis or slide along it"
-        model.add_fault(f"{name} is a {kind} joint{between}; {remedy}")
+        model.add_fault(f"joint {name} is a {kind} joint{between}, which is unsupported; {remedy}")
     elif joint.find("mimic") is not None or joint.find("axis/mimic") is not None:
-        remedy = "remove the tag, or fix the joint by slave.hold"
-        model.add_fault(f"{name} moves with another joint (mimic); {remedy}")
+        remedy = "add it to slave.hold, or remove the tag"
+        model.add_fault(f"joint {name} moves with another joint (mimic); {remedy}")
     axis = joint.find("axis")
     text = None if axis is None else axis.get("xyz") or axis.findtext("xyz")
     values = parse_numbers(text or "1 0 0")
     if len(values) != 3 or not all(map(math.isfinite, values)) or not any(values):
-        model.add_fault(f"{where}: axis {text!r} is no direction; give three numbers")
+        model.add_fault(f"{where}: axis {text!r} is no direction; give 3 numbers, not all 0")
 
 
 def _check_joint_limit(limit: Element, where: str, model: ModelRepair) -> None:
@@ -231,10 +231,10 @@ def _check_joint_dynamics(dynamics: Element, name: str, model: ModelRepair) -> N
     texts = [dynamics.get(tag) or dynamics.findtext(tag) for tag in ("damping", "friction")]
     damping, friction = (parse_number(text or "0") for text in texts)
     if friction != 0.0:
-        model.add_assumption("no dry friction, which the model has, of", name)
+        model.add_assumption("no effect of the dry friction in the file on", name)
         dynamics.attrib.pop("friction", None)
     if not damping >= 0.0:
-        model.add_repair("damping 0 in place of a negative or unreadable one for", name)
+        model.add_repair("damping is 0, not negative or unreadable, of joint", name)
         dynamics.attrib.pop("damping", None)
         for inner in dynamics.findall("damping"):
             dynamics.remove(inner)

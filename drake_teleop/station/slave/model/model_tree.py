@@ -66,8 +66,7 @@ def reduce_to_chain(
         groups = {num_joints_to_link.get(link_of_frame(scope, name), -1) for name in ends}
         scope.remove(element)
         if len(ends) < 2 or len(groups) > 1:
-            what = f"{element.tag} closes a loop of links"
-            model.add_fault(f"{what}; model only the chain to the sensor")
+            model.add_fault(f"{element.tag} closes a loop of links; remove this element")
     return chain, num_joints_to_link
 
 
@@ -110,7 +109,7 @@ def _weld_floating_base(scope: Element, chain: list[Element], model: ModelRepair
     if first is None or chain[first].get("type") not in ("floating", "planar"):
         return chain
     base = joint_link(chain[first], "child")
-    model.add_assumption("welded to the world, where it may float:", base)
+    model.add_assumption("welded to the world instead of floating:", base)
     scope.remove(chain[first])
     for link in scope.findall("link"):
         if link.get("name") == WORLD_NAME:

@@ -143,7 +143,7 @@ def _make_joint_and_link_names_unique(scope: Element, model: ModelRepair, *, is_
         name = joint.get("name", "")
         if not name or name in names:
             new = f"{name or 'joint'}_{number_of_joint}"
-            model.add_repair("a new name for the joint", f"{name or 'without name'} ({new})")
+            model.add_repair("a unique name for joint", f"{name or 'without name'} ({new})")
             joint.set("name", new)
         names.add(joint.get("name", ""))
     links, children = set[str](), Counter(joint_link(joint, "child") for joint in joints)
