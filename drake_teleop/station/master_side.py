@@ -52,7 +52,7 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
     builder = DiagramBuilder()
 
     name = "operator" if operator is None else "live_hand"
-    operator = builder.AddNamedSystem(name, operator or _make_operator(scenario, start_B))
+    operator = builder.AddNamedSystem(name, operator or _make_scenario_operator(scenario, start_B))
     period, model = 1 / scenario.rates.hand_hz, scenario.master.device(hand.mass, hand.inertia)
     q_start = model.inverse_kinematics(start_B)
     device, display = AddDeviceAndForceDisplay(builder, period, model, q_start)
@@ -102,7 +102,7 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
     return builder.Build()
 
 
-def _make_operator(scenario: Scenario, start_B: Array) -> Operator:
+def _make_scenario_operator(scenario: Scenario, start_B: Array) -> Operator:
     if scenario.operator.task is None:
         return Operator(scenario.operator, start_B)
     scaling, forces = scenario.kinematic_scaling, scenario.force_scaling

@@ -17,7 +17,7 @@ from drake_teleop.station.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.station.sensor.wrist_sensor import AddCompiledWristSensor
 from drake_teleop.station.signals import MOVING_BODY_POSE_PREFIX
 from drake_teleop.station.slave import joint_commands
-from drake_teleop.station.slave.arm import ARM_FRICTION_TANH_SPEED_RAD_OR_M_S, ForwardKinematics
+from drake_teleop.station.slave.arm import ARM_FRICTION_TANH_SPEED_SI, ForwardKinematics
 from drake_teleop.station.slave.joint_control import HeldTorque, JointControl, mass_matrix
 from drake_teleop.station.slave.plant import AddSlavePlant, SlavePlant
 from drake_teleop.station.slave.plant_dynamics import DrakeContact, ToolContact
@@ -26,9 +26,9 @@ from drake_teleop.station.slave.surroundings import MovingBodyPose
 from drake_teleop.station.wiring import connect_matching_inputs, connect_ports, export_outputs
 
 #: Sampling period of the monitor [s]; 2 kHz events would cost time.
-SLAVE_MONITOR_PERIOD_S = 0.01
+RANGE_MONITOR_PERIOD_S = 0.01
 # Stability limit of explicit steps for a decay, such as of speed by friction: rate times step.
-_MAX_FRICTION_RATE_TIMES_STEP = 2.0
+_MAX_DECAY_RATE_TIMES_STEP = 2.0
 
 
 def MakeSlaveSide(
@@ -74,7 +74,7 @@ def MakeSlaveSide(
     check_scenario(scenario)
     torques = _is_torque_controller(controller, scenario)
     uses_contact = controller is not None and controller.HasInputPort("contact_wrench_S")
-    _check_load_is_known(scenario, load_estimate, uses_contact)
+    _check_load_estimate(scenario, load_estimate, uses_contact)
     if load_covariance is not None:
         finite_array("load_covariance", load_covariance, 16, 16)
         expect_type((list, tuple, np.ndarray), load_estimate, "load_estimate", "pass both")
@@ -90,7 +90,7 @@ def MakeSlaveSide(
         connect_ports(builder, controller, "joint_torque", joint_control, "requested_torque")
     else:
         follows_leader = scenario.master.is_joint_leader
-        name = joint_commands.used_ik_method(scenario.slave.inverse_kinematics, arm)
+        name = joint_commands.pick_ik_method(scenario.slave.inverse_kinematics, arm)
         make_ik = joint_commands.IK_METHODS[name]
         if follows_leader:
             make_ik = joint_commands.LeaderJointFollower
@@ -211,7 +211,7 @@ def _add_slave_blocks(
     builder.Connect(torque["joint_torque"], plant.get_actuation_input_port(slave.instance))
     export_outputs(builder, control, "joint_torque")
 
-    range_monitor = joint_commands.JointRangeMonitor(arm, SLAVE_MONITOR_PERIOD_S)
+    range_monitor = joint_commands.JointRangeMonitor(arm, RANGE_MONITOR_PERIOD_S)
     monitor = builder.AddNamedSystem("monitor", range_monitor)
     connect_matching_inputs(builder, monitor, ports)
 
@@ -251,10 +251,10 @@ def _check_friction_time_step(slave: SlavePlant, step: float) -> None:
     if not slave.joint_friction.any():
         return
     mass = mass_matrix(slave.arm, slave.start)
-    slope = np.diag(slave.joint_friction / ARM_FRICTION_TANH_SPEED_RAD_OR_M_S)
+    slope = np.diag(slave.joint_friction / ARM_FRICTION_TANH_SPEED_SI)
     rate = float(np.linalg.eigvals(np.linalg.solve(mass, slope)).real.max())
-    if rate * step > _MAX_FRICTION_RATE_TIMES_STEP:
-        shorter = 0.9 * _MAX_FRICTION_RATE_TIMES_STEP / rate
+    if rate * step > _MAX_DECAY_RATE_TIMES_STEP:
+        shorter = 0.9 * _MAX_DECAY_RATE_TIMES_STEP / rate
         steps = f"too fast for steps of {1e3 * step:g} ms"
         what = f"the friction stops a joint within {1e3 / rate:.2g} ms, {steps}"
         remedy = f"reduce the friction, or set simulation.max_step: {shorter:.2g}"
@@ -277,7 +277,7 @@ def _add_contact_and_moving_body_poses(builder: DiagramBuilder, slave: SlavePlan
         export_outputs(builder, pose, **{MOVING_BODY_POSE_PREFIX + name: "pose"})
 
 
-def _check_load_is_known(scenario: Scenario, estimate: Array | None, uses_contact: bool) -> None:
+def _check_load_estimate(scenario: Scenario, estimate: Array | None, uses_contact: bool) -> None:
     if hasattr(estimate, "estimate"):
         what = f"expected 16 numbers, found {type(estimate).__name__}"
         remedy = "pass the attribute .estimate of this object"

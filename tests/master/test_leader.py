@@ -206,7 +206,7 @@ def test_joints_have_end_stops():
     assert np.isfinite(q).all()
     assert (q > limits[0] - 0.1).all() and (q < limits[1] + 0.1).all()
     beyond = np.clip(q, *limits) + np.where(q > 0, 1e-9, -1e-9)
-    assert device.is_any_axis_at_end_stop(
+    assert device.flag_samples_at_end_stop(
         np.array([HOME, np.maximum(beyond, limits[1] + 1e-6)])
     ).tolist() == [
         False,

@@ -29,7 +29,7 @@ from drake_teleop.station.signals import SIGNALS
 from drake_teleop.station.simulation import MakeSimulator, simulate
 from drake_teleop.station.slave.arm import ROTOR_COLUMN
 from drake_teleop.station.slave.chain_joints import AddSkeleton
-from drake_teleop.station.slave.joint_commands import JointRangeMonitor, used_ik_method
+from drake_teleop.station.slave.joint_commands import JointRangeMonitor, pick_ik_method
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.numeric_inverse_kinematics import NumericInverseKinematics
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave, ParseSlave, start_pose
@@ -142,14 +142,14 @@ def test_start_pose_and_assumptions(scenario):
 def test_arm_with_rx90_geometry_uses_closed_form():
     copy = Slave(model=str(models_dir() / "rx90.sdf"))
     arm = NominalSlave(copy).arm
-    assert used_ik_method("automatic", arm) == "closed_form"
+    assert pick_ik_method("automatic", arm) == "closed_form"
     np.testing.assert_array_equal(NominalSlave(copy).start, NominalSlave(Slave()).start)
     np.testing.assert_array_equal(NominalSlave(copy).tip, [0.0, 0.0, 0.2])
     moved = Slave(base_pose=[0.1, -0.2, 0.3, 0.0, 0.0, 0.5])
     arm = NominalSlave(moved).arm
-    assert used_ik_method("automatic", arm) == "numeric"
+    assert pick_ik_method("automatic", arm) == "numeric"
     with pytest.raises(DrakeTeleopError, match="closed form requires the geometry of an RX90"):
-        used_ik_method("closed_form", arm)
+        pick_ik_method("closed_form", arm)
     plant, context = NominalSlave(moved).plant, NominalSlave(moved).plant.CreateDefaultContext()
     found = plant.GetFrameByName("sensor").CalcPoseInWorld(context)
     np.testing.assert_allclose(found.translation(), [0.55, 0.0, 0.45], atol=1e-8)

@@ -96,7 +96,7 @@ def test_frames_and_classes_of_included_files_apply(tmp_path):
     np.testing.assert_allclose(
         pose(model, [0.7])[:, 3], [1, 0.4 * np.sin(0.7), 0.1 + 0.4 * np.cos(0.7)], atol=1e-12
     )
-    assert "named after its file: a" in said
+    assert "gets that of its file: a" in said
 
 
 @pytest.mark.parametrize(
@@ -373,7 +373,7 @@ BESIDE = (
         (JOINT, "", '<tendon><fixed><joint joint="j" coef="1"/></fixed></tendon>',
          "no effect of the tendons in the file on j"),
         (JOINT.replace("/>", ' stiffness="5"/>'), "", "", "no effect of the spring in .* on j"),
-        (JOINT.replace("/>", ' frictionloss="5"/>'), "", "", "no dry friction, .* of j"),
+        (JOINT.replace("/>", ' frictionloss="5"/>'), "", "", "dry friction in .* on j"),
         (JOINT.replace("/>", ' damping="-0.01"/>'), "", "", "damping is 0, not negative.* joint j"),
         (JOINT, '<geom type="mesh" mesh="none"/>', "", r"not found \(.*shapes are missing of b"),
         (JOINT, '<body name="flat"><inertial pos="0 0 0" mass="1" diaginertia="1 1 2.5"/></body>',
@@ -393,7 +393,7 @@ def test_repair_is_stated(tmp_path, joint, inside, tail, expected):
     text = mjcf(arm(joint, inside) + BESIDE, tail=tail)
     _, model, said = read(written(tmp_path, text, "a.xml"), "S", shapes=True)
     assert re.search(expected, said)
-    assert "does not carry it: cup, hand of god" in said
+    assert "beside the arm are left out: cup, hand of god" in said
     np.testing.assert_allclose(pose(model, [0.3])[:, 3], [np.sin(0.3) / 2, 0, np.cos(0.3) / 2])
 
 
@@ -410,7 +410,7 @@ def test_held_joint_has_the_drawn_or_requested_pose(tmp_path):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (mjcf(arm(inside='<replicate count="2"/>')), "b contains <replicate>"),
+        (mjcf(arm(inside='<replicate count="2"/>')), "b contains the unsupported <replicate>"),
         (mjcf(arm("<joint name='j' type='ball'/>")), "j is a ball joint"),
         (mjcf(arm(JOINT * 2)), "several joints are named j"),
         (mjcf(arm('<joint name="j" range="9 -9"/>')), "swap the ends of range, 9 to -9"),
@@ -482,8 +482,8 @@ def test_scene_keeps_its_bodies_and_refuses_what_drake_ignores(tmp_path):
     for what in ("dry friction", "position limits"):
         assert f"no effect of the {what} in the file on hinge" in notes
     for door, tail, expected in (
-        (DOOR.format(' stiffness="3"'), "", "no spring, .* of hinge"),
-        (DOOR.format(""), '<equality><weld body1="cup"/></equality>', "no coupling, .* by weld"),
+        (DOOR.format(' stiffness="3"'), "", "springs, .* lost: hinge"),
+        (DOOR.format(""), '<equality><weld body1="cup"/></equality>', "couplings .* lost: weld"),
         (DOOR.format("").replace('"box"', '"sdf"'), "", "shapes are missing of door"),
     ):
         with pytest.raises(DrakeTeleopError, match=expected):

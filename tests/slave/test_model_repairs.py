@@ -28,7 +28,7 @@ from drake_teleop.station.slave.model.model_numbers import (
 from drake_teleop.station.slave.model.model_repair import ModelPurpose, ModelRepair
 from drake_teleop.station.slave.model.urdf_and_sdf_repair import (
     _has_valid_colour,
-    find_dependence_reasons,
+    find_mimics_and_floating_links,
 )
 from drake_teleop.station.slave.models import ParseModel, ParseScene, translate_drake_errors
 from drake_teleop.station.slave.plant import NominalSlave
@@ -632,7 +632,7 @@ def test_coupled_joints_and_floating_links_are_dependent(inside, expected, paren
         f'<joint name="f" type="floating">{ends}</joint></r>'
     )
     floating = {} if parent == "world" else {"c": "floats on l2"}
-    assert find_dependence_reasons(root) == expected | floating
+    assert find_mimics_and_floating_links(root) == expected | floating
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ from drake_teleop.common.vectors import (
 _FIXED_JOINT, _REVOLUTE_JOINT, _PRISMATIC_JOINT, _FREE_JOINT = range(4)
 _PARENT_ROW_COLUMN, _JOINT_TYPE_COLUMN, _POSITION_INDEX_COLUMN, _VELOCITY_INDEX_COLUMN = range(4)
 _AXIS_COLUMN, _X_PF_COLUMN, _X_MB_COLUMN = 4, 7, 14
-NUM_JOINT_COLUMNS = 21
+NUM_JOINT_TABLE_COLUMNS = 21
 #: Numbers of a body: q_WB (4), p_WB (3), omega_WB_W (3), v_WB_W (3).
 BODY_STATE_SIZE = 13
 
@@ -60,11 +60,11 @@ def MakeJointTableAndRowBodies(
     for number in order:
         index, parent = above[number]
         row = order.index(parent) if parent in order else -1
-        rows.append(_joint_row(plant, context, plant.get_joint(tree.JointIndex(index)), row))
-    return np.array(rows).reshape(len(rows), NUM_JOINT_COLUMNS), order
+        rows.append(_table_row(plant, context, plant.get_joint(tree.JointIndex(index)), row))
+    return np.array(rows).reshape(len(rows), NUM_JOINT_TABLE_COLUMNS), order
 
 
-def _joint_row(plant: MultibodyPlant, context: Context, joint: tree.Joint, parent: int) -> Array:
+def _table_row(plant: MultibodyPlant, context: Context, joint: tree.Joint, parent: int) -> Array:
     F = joint.frame_on_parent()
     X_PF = F.CalcPoseInWorld(context) if parent < 0 else F.GetFixedPoseInBodyFrame()
     X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()

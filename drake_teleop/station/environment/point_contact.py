@@ -100,7 +100,7 @@ def FindContactPairs(
                     law = _combined_contact_law_parameters(inspector, own, other)
                     last = [direction, law, [slip_speed, row]]
                     place, half = [X_SShape.translation(), [sphere.radius()]], edges.size() / 2
-                    compiled_pairs.append(_shape_pair_row(place, X_Other, half, last))
+                    compiled_pairs.append(_make_pair_row(place, X_Other, half, last))
                 except DrakeTeleopError as beyond:
                     monitoring_reason = monitoring_reason or str(beyond)
                     own_box, box = _bounding_box(inspector, own), _bounding_box(inspector, other)
@@ -108,13 +108,13 @@ def FindContactPairs(
                     place = [X_SBox.translation(), [0.0]]
                     turned = [X_SBox.rotation().matrix().ravel(), own_box.half_width()]
                     last = [direction, [0.0] * 4, [slip_speed, row], *turned]
-                    monitored_pairs.append(_shape_pair_row(place, X_Other, box.half_width(), last))
+                    monitored_pairs.append(_make_pair_row(place, X_Other, box.half_width(), last))
     compiled = np.reshape(compiled_pairs, (len(compiled_pairs), NUM_PAIR_COLUMNS))
     monitored = np.reshape(monitored_pairs, (len(monitored_pairs), NUM_MONITORED_COLUMNS))
     return ShapePairs(compiled, monitored, monitoring_reason)
 
 
-def _shape_pair_row(
+def _make_pair_row(
     tool_columns: list[Any], X_Box: RigidTransform, half_edges: Array, law_columns: list[Any]
 ) -> Array:
     pose = X_Box.rotation().matrix().ravel(), X_Box.translation()

@@ -14,7 +14,7 @@ from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.files import models_dir
 from drake_teleop.station.environment import environment
 
-_BENCH_BOTTOM_TO_LEAF_HEIGHT_M = 0.15  # from the lower face of the model's bench to the leaf [m]
+_LEAF_HEIGHT_ABOVE_BENCH_M = 0.15  # from the lower face of the model's bench to the leaf [m]
 
 
 @settings
@@ -66,7 +66,7 @@ class SheetSpring(environment.Environment):
     @property
     def floor_stand(self) -> environment.FloorStand:
         x, y, z = self.position
-        return environment.FloorStand(0.34, 0.24, x + 0.065, y, z - _BENCH_BOTTOM_TO_LEAF_HEIGHT_M)
+        return environment.FloorStand(0.34, 0.24, x + 0.065, y, z - _LEAF_HEIGHT_ABOVE_BENCH_M)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         """Add the leaf to a plant; its joint "bending" deflects the free end along z_W [m]."""

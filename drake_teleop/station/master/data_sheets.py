@@ -64,7 +64,7 @@ class DeviceFigures:
 
 
 _WRIST_TURN_RAD, _NO_TURN_RAD = DeviceFigures().turn, [0.0, 0.0, 0.0]
-_OMEGA_WORKSPACE_M = [0.11, 0.113, 0.113]  # workspace
+_OMEGA_BOX_EDGES_M = [0.11, 0.113, 0.113]  # workspace
 _OMEGA_MAX_TURN_RAD = np.radians([120.0, 70.0, 160.0]).tolist()
 _OMEGA_STEPS_AND_RATE = 1e-5, math.radians(0.09), 4000.0  # steps [m], [rad]; rate [Hz]
 
@@ -74,20 +74,20 @@ _OMEGA_STEPS_AND_RATE = 1e-5, math.radians(0.09), 4000.0  # steps [m], [rad]; ra
 # mass and friction of the Touch, turns and steps of the omegas, position steps of Touch and Falcon,
 # rates but the Inverse3's, and the Virtuose's torque. The rest are estimates.
 # Only the Virtuose displays torque; omega.3 and Falcon do not rotate.
-_DATA_SHEET_ROWS: dict[str, tuple[Any, ...]] = {
+_DATA_SHEET_VALUES: dict[str, tuple[Any, ...]] = {
     # name            kg     N     N     m                   rad         m        rad          Hz
     "geomagic_touch": (0.045, 0.26, 3.3, [0.07, 0.16, 0.12], _WRIST_TURN_RAD, 5.5e-5, 2e-3, 1000.0),
-    "omega_3": (0.25, 0.3, 12.0, _OMEGA_WORKSPACE_M, _NO_TURN_RAD, *_OMEGA_STEPS_AND_RATE),
-    "omega_6": (0.3, 0.3, 12.0, _OMEGA_WORKSPACE_M, _OMEGA_MAX_TURN_RAD, *_OMEGA_STEPS_AND_RATE),
-    "omega_7": (0.35, 0.3, 12.0, _OMEGA_WORKSPACE_M, _OMEGA_MAX_TURN_RAD, *_OMEGA_STEPS_AND_RATE),
+    "omega_3": (0.25, 0.3, 12.0, _OMEGA_BOX_EDGES_M, _NO_TURN_RAD, *_OMEGA_STEPS_AND_RATE),
+    "omega_6": (0.3, 0.3, 12.0, _OMEGA_BOX_EDGES_M, _OMEGA_MAX_TURN_RAD, *_OMEGA_STEPS_AND_RATE),
+    "omega_7": (0.35, 0.3, 12.0, _OMEGA_BOX_EDGES_M, _OMEGA_MAX_TURN_RAD, *_OMEGA_STEPS_AND_RATE),
     "falcon": (0.2, 0.5, 8.9, [0.102] * 3, _NO_TURN_RAD, 6.35e-5, 0.0, 1000.0),
     "haply_inverse3": (0.2, 0.15, 10.0, [0.2, 0.34, 0.19], _WRIST_TURN_RAD, 2e-5, 2e-3, 4000.0),
     "virtuose_6d": (1.0, 1.0, 35.0, [0.26] * 3, _WRIST_TURN_RAD, 2e-5, 2e-4, 1000.0),
 }  # fmt: skip
 _SHEET_FIELDS = "apparent_mass friction peak_force size turn resolution turn_resolution rate_hz"
-_figures_by_name = {
+_data_sheets_by_name = {
     name: DeviceFigures(**dict(zip(_SHEET_FIELDS.split(), row, strict=True)))
-    for name, row in _DATA_SHEET_ROWS.items()
+    for name, row in _DATA_SHEET_VALUES.items()
 }
 
 
@@ -96,7 +96,7 @@ class _DataSheetRegistry(Presets[DeviceFigures], Registry[DeviceFigures]):
 
 
 #: Data sheets by name, for `Master.figures`.
-FIGURES = _DataSheetRegistry("device", _figures_by_name, DeviceFigures)
+FIGURES = _DataSheetRegistry("device", _data_sheets_by_name, DeviceFigures)
 FIGURES["virtuose_6d"] = dataclasses.replace(
     FIGURES["virtuose_6d"], inertia=5e-3, friction_torque=0.03, peak_torque=[3.1] * 3
 )

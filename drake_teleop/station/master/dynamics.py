@@ -133,11 +133,11 @@ class HapticDevice:
         else:
             task_space.check_limits(q, self.parameters)
 
-    def is_any_axis_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
+    def flag_samples_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
         """Return flags (N,): True where an end stop acts at the row of q (N, 6)."""
         if self.is_phantom:
-            return phantom.is_any_axis_at_end_stop(q)
-        return task_space.is_any_axis_at_end_stop(q, self.parameters)
+            return phantom.flag_samples_at_end_stop(q)
+        return task_space.flag_samples_at_end_stop(q, self.parameters)
 
     def jacobian(self, q: Array) -> Array:
         J = np.empty((6, 6))

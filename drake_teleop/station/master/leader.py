@@ -34,7 +34,7 @@ from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 _COULOMB_ROW, _DAMPING_ROW, _MIN_Q_ROW, _MAX_Q_ROW, _STOP_STIFFNESS_ROW = range(5)
 _STOP_DAMPING_ROW, _TORQUE_LIMIT_ROW, _CARRIED_WEIGHT_SHARE_ROW = range(5, 8)
 # Coulomb friction is proportional to the tanh of speed over this one: a slower joint creeps.
-LEADER_FRICTION_TANH_SPEED_RAD_OR_M_S = 0.02  # rad/s or m/s, estimate
+LEADER_FRICTION_TANH_SPEED_SI = 0.02  # rad/s or m/s, estimate
 # Natural frequency of the critically damped end stops with the joint's inertia, estimate.
 _END_STOP_NATURAL_FREQUENCY_HZ = 12.0
 
@@ -52,7 +52,7 @@ def leader_acceleration_into(arm, joint_table, q, v, hand_wrench_minus_weight, m
     add_vector_into(wrench, 3, cross(vector_at(p_BE, 0), vector_at(wrench, 0)))
     for i in range(n):
         tau[i] = motor[i] - joint_table[_COULOMB_ROW, i] * math.tanh(
-            v[i] / LEADER_FRICTION_TANH_SPEED_RAD_OR_M_S
+            v[i] / LEADER_FRICTION_TANH_SPEED_SI
         )
         tau[i] -= joint_table[_DAMPING_ROW, i] * v[i]
         lower, upper, stiffness, damping = joint_table[_MIN_Q_ROW : _STOP_DAMPING_ROW + 1, i]
@@ -237,7 +237,7 @@ class LeaderDevice:
             remedy = "choose leader.home and master.position within the joint limits"
             raise DrakeTeleopError(what, where="master.leader.home", remedy=remedy)
 
-    def is_any_motor_at_limit(self, q: Array, F: Array, share: float) -> NDArray[np.bool_]:
+    def flag_samples_at_motor_limit(self, q: Array, F: Array, share: float) -> NDArray[np.bool_]:
         """Return flags (N,): True if a motor's torque is at least `share` of its limit.
 
         The motors compensate the weight at joint positions q (N, n) and display F (N, 6) at E.
@@ -245,7 +245,7 @@ class LeaderDevice:
         constants = self.compiled_constants
         return np.asarray(_flag_samples_with_motor_at_limit(constants, q.copy(), F.copy(), share))
 
-    def is_any_axis_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
+    def flag_samples_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
         return ((q < self.joint_table[_MIN_Q_ROW]) | (q > self.joint_table[_MAX_Q_ROW])).any(axis=1)
 
     def jacobian(self, q: Array) -> Array:
@@ -258,7 +258,7 @@ class LeaderDevice:
 
     def damping_matrix(self, q: Array, include_coulomb_slope: bool = False) -> Array:
         own = self.joint_table[_DAMPING_ROW] + self.arm.table[:-1, serial_arm.DAMPING_COLUMN]
-        slope = self.joint_table[_COULOMB_ROW] / LEADER_FRICTION_TANH_SPEED_RAD_OR_M_S
+        slope = self.joint_table[_COULOMB_ROW] / LEADER_FRICTION_TANH_SPEED_SI
         return np.diag(own + include_coulomb_slope * slope)
 
 

@@ -128,7 +128,7 @@ def _are_axes_past_end_stop(q: Array, device: DeviceParameters, margin: float) -
     return np.abs(q - centre) > half + margin
 
 
-def is_any_axis_at_end_stop(q: Array, device: DeviceParameters) -> NDArray[np.bool_]:
+def flag_samples_at_end_stop(q: Array, device: DeviceParameters) -> NDArray[np.bool_]:
     has_end_stop = np.append([True] * 3, device.max_rotation > 0.0)
     return (_are_axes_past_end_stop(q, device, 0.0) & has_end_stop).any(axis=1)
 

@@ -271,7 +271,7 @@ class WristSensor(LeafSystem):
         motion_constants, estimator = motion_estimation.initialize_motion_estimator(
             motion, config, n, period
         )
-        self._physics, contact = slave.physics_of_plant, slave.contact
+        self._physics, contact = slave.compiled_constants, slave.contact
         #: Offset (6,) of force and torque [N, N m] and inertial parameters (10,) of the tool; both
         #: are views that may be changed during a run.
         self.offset, self.phi = constants["offset"][0, :6], self._physics[1]
@@ -310,7 +310,7 @@ class WristSensor(LeafSystem):
         self._acceleration = self.DeclareVectorInputPort("slave_acceleration", n)
         self._applied = self.DeclareVectorInputPort("applied_wrench_W", 6)
         self._sheet = self._contacts = self._noise = self._plant = None
-        if slave.compiled_sheet_instance is not None:
+        if slave.leaf_instance_in_compiled_law is not None:
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
         if contact.plant_state_size:
             self._plant = self.DeclareVectorInputPort("plant_state", contact.plant_state_size)

@@ -35,8 +35,8 @@ from drake_teleop.common.vectors import (
 # Columns of ArmModel.table.
 ROTATION_COLUMN, TRANSLATION_COLUMN, PHI_COLUMN, ROTOR_COLUMN = 0, 9, 12, 22
 DAMPING_COLUMN, DRY_FRICTION_COLUMN, IS_PRISMATIC_COLUMN = 23, 24, 25
-NUM_TABLE_COLUMNS = 26
-ARM_FRICTION_TANH_SPEED_RAD_OR_M_S = 2e-3
+NUM_ARM_TABLE_COLUMNS = 26
+ARM_FRICTION_TANH_SPEED_SI = 2e-3
 """Speed v_0 of the dry friction tau = -tau_C tanh(v / v_0) [rad/s, m/s], estimate."""
 LAST_ROW_GRAVITY_COLUMN = 22  # first of three columns with gravity, in the last row only
 
@@ -353,7 +353,7 @@ def _lower_mass_matrix_into(table: Array, link: Array, inertia: Array, M: Array)
 @njit(cache=True)
 def dry_friction(coulomb: float, speed: float) -> float:
     """Return the dry friction torque [N m], opposite to the speed [rad/s] and at most `coulomb`."""
-    return -coulomb * np.tanh(speed / ARM_FRICTION_TANH_SPEED_RAD_OR_M_S)
+    return -coulomb * np.tanh(speed / ARM_FRICTION_TANH_SPEED_SI)
 
 
 @njit(cache=True)

@@ -20,7 +20,7 @@ from drake_teleop.station.slave.arm import (
     DAMPING_COLUMN,
     IS_PRISMATIC_COLUMN,
     LAST_ROW_GRAVITY_COLUMN,
-    NUM_TABLE_COLUMNS,
+    NUM_ARM_TABLE_COLUMNS,
     PHI_COLUMN,
     ROTATION_COLUMN,
     ROTOR_COLUMN,
@@ -56,7 +56,7 @@ def ArmModelFromPlant(
     motors = [[a for a in actuators if a.joint().index() == j.index()] for j in joints]
     efforts = [min((motor.effort_limit() for motor in each), default=np.inf) for each in motors]
     n = len(joints)
-    table = np.zeros((n + 1, NUM_TABLE_COLUMNS))
+    table = np.zeros((n + 1, NUM_ARM_TABLE_COLUMNS))
     for row, joint in enumerate(joints):
         table[row, ROTOR_COLUMN] = sum(motor.default_reflected_inertia() for motor in motors[row])
         table[row, DAMPING_COLUMN] = joint.default_damping()
@@ -96,7 +96,7 @@ def ArmModelFromPlant(
 def _joint_limits(joint: OneAxisJoint) -> tuple[float, float, float, float]:
     """Return lower, upper, speed and acceleration limit of a joint; infinite for no limit."""
     lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
-    limit = chain_joints.MAX_PLAUSIBLE_LIMIT_RAD_OR_M
+    limit = chain_joints.MAX_JOINT_POSITION_LIMIT_SI
     # Exporters write 0 to 0 for unknown limits.
     is_unknown = isinstance(joint, tree.RevoluteJoint) and lower == upper == 0.0
     lower = -np.inf if is_unknown or lower < -limit else lower

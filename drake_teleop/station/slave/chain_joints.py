@@ -28,7 +28,7 @@ _PRISMATIC_DRIVE_MASS_KG = 5.0  # mass that moves with a prismatic joint instead
 # Largest mass of a sensor body that is only a frame, and its largest distance to the origin of the
 # link that it shares.
 _MAX_FRAME_MASS_KG, _MAX_FRAME_OFFSET_M = 1e-6, 1e-6
-MAX_PLAUSIBLE_LIMIT_RAD_OR_M = 1e4  # larger: no limit; SDF specifies 1e16
+MAX_JOINT_POSITION_LIMIT_SI = 1e4  # larger: no limit; SDF specifies 1e16
 _SKELETON_CAPSULE_RADIUS_M = 0.035
 _SKELETON_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
 

@@ -24,8 +24,8 @@ SHOULDER_HEIGHT_M, UPPER_ARM_LENGTH_M = 0.420, 0.450
 #: Elbow to wrist centre [m]; wrist centre to the origin of S, along z_S [m].
 FOREARM_LENGTH_M, WRIST_TO_S_M = 0.450, 0.085
 
-# Distance from the first axis [m], or sin q5, below which the arm is singular.
-_MAX_SINGULAR_DISTANCE_OR_SIN_Q5 = 1e-9
+# Distance of the wrist from the first axis, and sin q5, below which the arm is singular.
+_MAX_SINGULAR_DISTANCE_M, _MAX_SINGULAR_SIN_Q5 = 1e-9, 1e-9
 # Tolerance of a joint limit [rad]; the angle is clipped to the limit.
 _JOINT_LIMIT_TOLERANCE_RAD = 1e-9
 
@@ -82,7 +82,7 @@ def _solve_all_branches_into(R: Array, p: Array, q1_kept: float, q4_kept: float,
         distance *= scale
         status = _OUT_OF_REACH
     rho = np.sqrt(x * x + y * y)
-    if rho < _MAX_SINGULAR_DISTANCE_OR_SIN_Q5:
+    if rho < _MAX_SINGULAR_DISTANCE_M:
         q1_front = q1_kept
         status = max(status, _SHOULDER_SINGULAR)
     else:
@@ -110,7 +110,7 @@ def _solve_all_branches_into(R: Array, p: Array, q1_kept: float, q4_kept: float,
             m00 = c * (c1 * R[0, 0] + s1 * R[1, 0]) + s * R[2, 0]
             m01 = c * (c1 * R[0, 1] + s1 * R[1, 1]) + s * R[2, 1]
             sin_q5 = np.sqrt(m02 * m02 + m12 * m12)
-            q4_up = q4_kept if sin_q5 < _MAX_SINGULAR_DISTANCE_OR_SIN_Q5 else np.arctan2(-m12, -m02)
+            q4_up = q4_kept if sin_q5 < _MAX_SINGULAR_SIN_Q5 else np.arctan2(-m12, -m02)
             q5_up = np.arctan2(sin_q5, m22)
             # q6 depends on q4, so that an inexact q4 near the singularity cancels.
             c4, s4 = np.cos(q4_up), np.sin(q4_up)
@@ -166,7 +166,7 @@ def _nearest_branch_into(
     if best < 0:
         return _JOINT_LIMIT
     copy_into(q, 0, branches[best], 0, 6)
-    if abs(np.sin(q[4])) < _MAX_SINGULAR_DISTANCE_OR_SIN_Q5:
+    if abs(np.sin(q[4])) < _MAX_SINGULAR_SIN_Q5:
         status = max(status, _WRIST_SINGULAR)
     return status
 

@@ -37,7 +37,7 @@ IK_METHODS: Registry[Callable[[ArmModel, Array, float], LeafSystem]] = Registry(
 _JOINT_LIMIT_TOLERANCE_TO_RANGE_RATIO = 0.01
 
 
-def used_ik_method(name: str, arm: ArmModel) -> str:
+def pick_ik_method(name: str, arm: ArmModel) -> str:
     """Return the `IK_METHODS` key of setting `name`; raise DrakeTeleopError if the arm lacks it."""
     if name == AUTOMATIC_IK_METHOD:
         return "closed_form" if has_closed_form(arm) else "numeric"

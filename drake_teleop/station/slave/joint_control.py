@@ -65,7 +65,7 @@ class PositionInterface:
             raise DrakeTeleopError(what, where=f"{where}.drive_bandwidth_hz", remedy=remedy)
 
 
-_position_interfaces = {
+_interface_presets = {
     "ur_servoj": PositionInterface(),
     "franka_position": PositionInterface(
         command_hz=1000.0,
@@ -78,7 +78,7 @@ _position_interfaces = {
     ),
 }
 #: Interfaces by name; docs/station.md lists the sources.
-POSITION_INTERFACE_PRESETS = Presets(_position_interfaces)
+POSITION_INTERFACE_PRESETS = Presets(_interface_presets)
 
 
 @settings

@@ -32,9 +32,9 @@ _ROBOT_PACKAGE_REMEDY = "with --package-path for package://"
 _SCENE_PACKAGE_REMEDY = "its package:// addresses in folders around it"
 # Places in Drake's source and in repaired texts, which the user does not have.
 _DRAKE_SOURCE_PREFIX_PATTERN = re.compile(r"Failure at \S+ in \w+(\(\))?: ")
-_STRING_LOCATION_IN_MESSAGE_PATTERN = re.compile(r"<(literal|data)-string>(\.\w+)?(:\d+)*:? ?")
+_REPAIRED_TEXT_LOCATION_PATTERN = re.compile(r"<(literal|data)-string>(\.\w+)?(:\d+)*:? ?")
 _REPAIRED_FILE_PATTERN = r"(file://)?{folder}/\d+_([^\s:'\"]*)(:\d+)*"
-_MAX_ERROR_SEPARATORS_LENGTH = 30  # " ... " and separators of the error line
+_NUM_SEPARATOR_CHARACTERS = 30  # " ... " and separators of the error line
 
 
 def repair_and_parse_model(
@@ -89,7 +89,7 @@ def _add_directives(parser: parsing.Parser, model: ModelRepair) -> list[ModelIns
         if file is None:
             continue  # Drake reports it
         if file not in parts:
-            parts[file] = model.repair_part(file, _repair_model_text)
+            parts[file] = model.repair_file(file, _repair_model_text)
         if parts[file].text:
             added.file = f"file://{model.write_file(file.name, parts[file].text)}"
         reasons = parts[file].dependence_reasons
@@ -202,7 +202,7 @@ def ParseScene(plant: MultibodyPlant, path: Path) -> list[str]:
         raise DrakeTeleopError(f"{name} {what}", where=str(path), remedy=remedy)
     for joint in (plant.get_joint(k) for each in instances for k in plant.GetJointIndices(each)):
         limits = *joint.position_lower_limits(), *joint.position_upper_limits()
-        if any(abs(limit) < chain_joints.MAX_PLAUSIBLE_LIMIT_RAD_OR_M for limit in limits):
+        if any(abs(limit) < chain_joints.MAX_JOINT_POSITION_LIMIT_SI for limit in limits):
             model.add_assumption("no effect of the position limits in the file on", joint.name())
     return model.assumptions
 
@@ -236,13 +236,13 @@ def translate_drake_errors(
     # SystemExit: failed condition in Drake; LookupError: from C++ containers.
     except (RuntimeError, SystemExit, ValueError, LookupError) as error:
         reason = _DRAKE_SOURCE_PREFIX_PATTERN.sub("", " ".join(str(error).split()))
-        reason = _STRING_LOCATION_IN_MESSAGE_PATTERN.sub("", reason)
+        reason = _REPAIRED_TEXT_LOCATION_PATTERN.sub("", reason)
         if folder:
             reason = re.sub(_REPAIRED_FILE_PATTERN.format(folder=re.escape(folder)), r"\2", reason)
         what = f"cannot be read as a {'scene' if is_scene else 'robot'}"
         packages = _SCENE_PACKAGE_REMEDY if is_scene else _ROBOT_PACKAGE_REMEDY
         remedy = f"give a URDF, SDF, MJCF or .dmd.yaml model, {packages}"
-        room = MAX_ERROR_LINE_LENGTH - _MAX_ERROR_SEPARATORS_LENGTH - len(f"{path}{what}{remedy}")
+        room = MAX_ERROR_LINE_LENGTH - _NUM_SEPARATOR_CHARACTERS - len(f"{path}{what}{remedy}")
         if len(reason) > room:
             reason = f"{reason[:room]} ..."
         raise DrakeTeleopError(what, where=str(path), remedy=f"{remedy} ({reason})") from None

@@ -48,7 +48,7 @@ _MIN_OUT_OF_REACH_ERROR_FEW_JOINTS_M = 1e-3
 # Largest joint displacement to escape from a singularity [rad, m].
 _MAX_SINGULARITY_ESCAPE_RAD_OR_M, _SEARCH_SINGULARITY_ESCAPE_RAD_OR_M = 0.05, 0.3
 # Triple product of the last three axes below which the wrist is singular.
-_MAX_SINGULAR_WRIST_TRIPLE_PRODUCT = 0.1
+_MAX_COPLANAR_WRIST_TRIPLE_PRODUCT = 0.1
 
 _STATUS_OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, *_others = map(int, IkStatus)
 _JOINT_LIMIT, _BAD_POSE, _SPEED_LIMIT = _others
@@ -156,7 +156,7 @@ def _classify_wrist_or_shoulder_singularity(L, J):
         vectors.vector_at(J[3:, n - 2], 0),
         vectors.vector_at(J[3:, n - 1], 0),
     )
-    coplanar = abs(vectors.dot(a, vectors.cross(b, c))) < _MAX_SINGULAR_WRIST_TRIPLE_PRODUCT * L**3
+    coplanar = abs(vectors.dot(a, vectors.cross(b, c))) < _MAX_COPLANAR_WRIST_TRIPLE_PRODUCT * L**3
     return _WRIST_SINGULAR if coplanar else _SHOULDER_SINGULAR
 
 

@@ -32,7 +32,7 @@ from drake_teleop.station.slave.surroundings import (
 )
 
 # Shapes that end within this distance of the farthest end share the contact, as two fingers do [m].
-_TIP_END_TOLERANCE_M = 1e-3
+_SHARED_TIP_TOLERANCE_M = 1e-3
 _NUM_CIRCLE_POINTS = 24  # points on a circumference of a round shape
 ARM_INSTANCE_NAME = "arm"  #: name of the arm's model instance in every plant
 
@@ -66,7 +66,7 @@ class SlavePlant:
     environment: Environment | None
 
     @cached_property
-    def physics_of_plant(self) -> tuple[Array, ...]:
+    def compiled_constants(self) -> tuple[Array, ...]:
         """Argument `physics` of `contact_and_plant_rates_into`.
 
         Its arrays are: `ArmModel.table` with dry friction; the load in this table, which a grasp
@@ -101,7 +101,7 @@ class SlavePlant:
         return len(self.contact.compiled_pairs) > 0 or bool(self.contact.drake_contact_reason)
 
     @property
-    def compiled_sheet_instance(self) -> ModelInstanceIndex | None:
+    def leaf_instance_in_compiled_law(self) -> ModelInstanceIndex | None:
         """Model instance of the leaf if the compiled law computes its contact, else None."""
         return None if self.contact.drake_contact_reason else self.contact.leaf_instance
 
@@ -171,7 +171,7 @@ def AddSlavePlant(
         finalize_without_limit_warnings(plant)
     contact = ToolContactModel()
     if environment is not None and surroundings is not None:
-        _remove_shapes_without_contact(plant, scene_graph, arm_shapes)
+        _remove_visual_and_arm_shapes(plant, scene_graph, arm_shapes)
         frame = parsed.sensor_frame
         contact = MakeToolContactModel(plant, scene_graph, frame, tool, environment, surroundings)
     arm, assumptions = parsed.arm()
@@ -188,7 +188,7 @@ def AddSlavePlant(
         builder.Connect(block.GetOutputPort("generalized_force"), force)
     plant.SetDefaultPositions(instance, start)
     X_WS_start = arm.pose(start) if slave.home else start_pose(slave)
-    tip, texts = _tool_tip_S(plant, slave, parsed, arm), (*parsed.assumptions, *assumptions)
+    tip, texts = _tip_in_S(plant, slave, parsed, arm), (*parsed.assumptions, *assumptions)
     parts = plant, instance, parsed.sensor_frame, tool, arm, start, X_WS_start, tip, contact
     return SlavePlant(*parts, texts, slave, environment)
 
@@ -253,7 +253,7 @@ def finalize_without_limit_warnings(plant: MultibodyPlant) -> None:
         joint.set_position_limits(lower, upper)
 
 
-def _remove_shapes_without_contact(
+def _remove_visual_and_arm_shapes(
     plant: MultibodyPlant, scene: geometry.SceneGraph, arm_shapes: list[geometry.GeometryId]
 ) -> None:
     source = plant.get_source_id()
@@ -264,7 +264,7 @@ def _remove_shapes_without_contact(
         scene.RemoveRole(source, shape, geometry.Role.kProximity)
 
 
-def _hulls_of_carried_shapes_S(slave: Slave) -> list[Array]:
+def _hull_points_beyond_sensor_S(slave: Slave) -> list[Array]:
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.0)
     parsed = ParseSlave(plant, slave)
     finalize_without_limit_warnings(plant)
@@ -314,7 +314,7 @@ def _unit_sphere_points() -> Array:
     return np.stack([x, y, np.sin(latitudes)], axis=-1).reshape(-1, 3)
 
 
-def _tool_tip_S(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: ArmModel) -> Array:
+def _tip_in_S(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: ArmModel) -> Array:
     if slave.tip:
         return np.array(slave.tip, dtype=np.float64)
     instance = plant.get_body(parsed.tool).model_instance()
@@ -326,11 +326,11 @@ def _tool_tip_S(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: A
     if slave.tool is not None and slave.tool.mass > 0.0:
         end = tip_of_tool_shapes(slave.tool)
         return arm.phi_load[1:4] / arm.phi_load[0] if end is None else np.array(end)
-    hulls = _hulls_of_carried_shapes_S(slave)
+    hulls = _hull_points_beyond_sensor_S(slave)
     if not hulls:
         return arm.phi_load[1:4] / arm.phi_load[0]
     reach = max(hull[:, 2].max() for hull in hulls)
-    farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _TIP_END_TOLERANCE_M]
+    farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _SHARED_TIP_TOLERANCE_M]
     middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in farthest]
     return np.array([*np.mean(middles, axis=0), reach])
 

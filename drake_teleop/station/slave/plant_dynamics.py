@@ -70,7 +70,7 @@ def environment_wrench_about_Wo_into(arm, pairs, joints, applied_W, q, v, sheet,
     forward_kinematics(arm, q, R_WS, p_WS)
     add_vector_into(wrench_W, 3, cross(p_WS, applied_W))
     for pair in pairs:
-        box = _place_box_at_body(pair, bodies, placed)
+        box = _move_box_with_body(pair, bodies, placed)
         depth = depth_of_sphere_in_box(box, p_WS, R_WS, sheet[0], normal)
         if depth <= 0.0:
             continue
@@ -94,7 +94,7 @@ def environment_wrench_about_Wo_into(arm, pairs, joints, applied_W, q, v, sheet,
 
 
 @njit(cache=True)
-def _place_box_at_body(pair, bodies, placed):
+def _move_box_with_body(pair, bodies, placed):
     """Return the pair, with a moving box at its present pose; `placed` (28,) is memory for that."""
     if pair[BOX_BODY_ROW_COLUMN] < 0.0:
         return pair
@@ -120,12 +120,12 @@ def tool_proximity(arm, pairs, monitored_pairs, joints, q, sheet, state):
     poses_and_twists_into(joints, state, bodies)
     forward_kinematics(arm, q, R_WS, p_WS)
     for pair in monitored_pairs:
-        box = _place_box_at_body(pair, bodies, placed)
+        box = _move_box_with_body(pair, bodies, placed)
         distance = lower_bound_of_box_distance(pair, box, p_WS, R_WS, sheet[0])
         if distance < _MAX_DISTANCE_OF_NEAR_PAIRS_M:
             return PROXIMITY_NEAR_MONITORED
     for pair in pairs:
-        box = _place_box_at_body(pair, bodies, placed)
+        box = _move_box_with_body(pair, bodies, placed)
         if depth_of_sphere_in_box(box, p_WS, R_WS, sheet[0], normal) > -_MAX_TOUCHING_GAP_M:
             return PROXIMITY_TOUCHING
     return PROXIMITY_FAR
@@ -183,14 +183,14 @@ def assemble_plant_state_into(state, surroundings, x):
 def contact_and_plant_rates_into(physics, x, tau, applied_W, wrench_W, xdot):
     """Write xdot (2 n + 2,), the derivative of arm and leaf in x, and the contact wrench about Wo.
 
-    `physics` is `SlavePlant.physics_of_plant`, `tau` (n,) the motor torques [N m], `applied_W` (6,)
-    a wrench that is added, about So.
+    `physics` is `SlavePlant.compiled_constants`, `tau` (n,) the motor torques [N m], `applied_W`
+    (6,) a wrench that is added, about So.
     """
     arm, _, pairs, _, joints, given = physics
     half = tau.shape[0] + 1
     q, v = x[: half - 1], x[half : 2 * half - 1]
     sheet, rest = x[half - 1 : 2 * half : half], x[2 * half :]
-    if not _copy_or_request_wrench(given, x, wrench_W):
+    if not _replay_or_request_wrench(given, x, wrench_W):
         environment_wrench_about_Wo_into(arm, pairs, joints, applied_W, q, v, sheet, rest, wrench_W)
     else:
         added, none = np.empty(6), pairs[:0]
@@ -200,7 +200,7 @@ def contact_and_plant_rates_into(physics, x, tau, applied_W, wrench_W, xdot):
 
 
 @njit(cache=True)
-def _copy_or_request_wrench(given, x, wrench_W):
+def _replay_or_request_wrench(given, x, wrench_W):
     """Copy the next given wrench to `wrench_W` and return True; if none is left, return False.
 
     `given` is empty, or a header and then wrenches (6,). The header contains the number of

@@ -40,7 +40,7 @@ MIN_OVERLAP_M = 1e-3  #: larger overlaps are reported; smaller ones are rounding
 _MAX_CHECKED_SHAPE_HALF_WIDTH_M = 1e3  # m; at 1e4 Drake's distance query aborts or hangs
 # Pairs that overlap in this share of random postures overlap by design.
 _NUM_SAMPLED_POSTURES, _OVERLAP_BY_DESIGN_POSTURE_SHARE = 200, 0.95
-_MIN_COSINE_OF_TELESCOPE_AXES = 0.999  # cosine of the angle between the axes of a telescope
+_MIN_COSINE_OF_PARALLEL_AXES = 0.999  # cosine of the angle between the axes of a telescope
 
 
 class PostureShapes:
@@ -161,7 +161,7 @@ class PostureShapes:
                 R_WF = joint.frame_on_parent().CalcPoseInWorld(context).rotation()
                 axis = R_WF @ joint.translation_axis()
                 for other, bodies in telescopes:
-                    if bodies & joined and abs(axis @ other) > _MIN_COSINE_OF_TELESCOPE_AXES:
+                    if bodies & joined and abs(axis @ other) > _MIN_COSINE_OF_PARALLEL_AXES:
                         joined |= bodies
                 telescopes.append((axis, joined))
             together.append(joined)
@@ -173,7 +173,7 @@ class PostureShapes:
     def _body_pairs_overlapping_by_design(self) -> set[tuple[BodyIndex, BodyIndex]]:
         random, counts = np.random.default_rng(0), Counter[tuple[BodyIndex, BodyIndex]]()
         least = int(np.ceil(_OVERLAP_BY_DESIGN_POSTURE_SHARE * _NUM_SAMPLED_POSTURES))
-        limits = joint_sampling_range(self.arm)
+        limits = random_posture_limits(self.arm)
         for left in range(_NUM_SAMPLED_POSTURES, 0, -1):
             self.move_to(random.uniform(*limits))
             counts.update(p for p in self._overlap_distances() if not self.surroundings & set(p))
@@ -182,7 +182,7 @@ class PostureShapes:
         return {pair for pair, count in counts.items() if count >= least}
 
 
-def joint_sampling_range(arm: ArmModel) -> tuple[Array, Array]:
+def random_posture_limits(arm: ArmModel) -> tuple[Array, Array]:
     """Return finite lower and upper limits (n,): +-pi if infinite, or if beyond both -pi and pi."""
     wide = arm.upper - arm.lower > 2.0 * np.pi + 1e-9
     around_zero = wide & (arm.lower <= -np.pi) & (arm.upper >= np.pi)

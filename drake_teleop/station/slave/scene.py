@@ -17,7 +17,7 @@ from drake_teleop.station.slave.models import ParseScene
 from drake_teleop.station.slave.surroundings import supports_pose_conversion
 
 _RESERVED_BODY_NAMES = {"tool", "leaf", "block", "sensor", "tip", "stylus"}
-_TOOL_BALL_MESH_EDGE_M = 0.005  # m, edge length of the mesh of the tool's ball
+_TOOL_MESH_EDGE_LENGTH_M = 0.005  # m, edge length of the mesh of the tool's ball
 
 
 @settings
@@ -106,7 +106,7 @@ class Scene(Environment):
         for shape in own:
             material = geometry.ProximityProperties(inspector.GetProximityProperties(shape))
             if not has_hydroelastic_properties(material):
-                edge, modulus = _TOOL_BALL_MESH_EDGE_M, self.tool_modulus
+                edge, modulus = _TOOL_MESH_EDGE_LENGTH_M, self.tool_modulus
                 geometry.AddCompliantHydroelasticProperties(edge, modulus, material)
                 replace = geometry.RoleAssign.kReplace
                 scene_graph.AssignRole(plant.get_source_id(), shape, material, replace)

@@ -48,7 +48,7 @@ class ToolContactModel(NamedTuple):
 
     compiled_pairs: Array = np.zeros((0, point_contact.NUM_PAIR_COLUMNS))
     monitored_pairs: Array = np.zeros((0, point_contact.NUM_MONITORED_COLUMNS))
-    joint_table: Array = np.zeros((0, moving_bodies.NUM_JOINT_COLUMNS))
+    joint_table: Array = np.zeros((0, moving_bodies.NUM_JOINT_TABLE_COLUMNS))
     plant_state_size: int = 0
     drake_contact_reason: str = ""
     tool_bodies: frozenset[int] = frozenset()

@@ -19,7 +19,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.model import model_references, model_repair
 from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI, parse_numbers
 
-_SIZE_VALUE_COUNTS_BY_SHAPE = {
+_NUM_SIZE_VALUES_OF_SHAPE = {
     "box": {"size": 3},
     "sphere": {"radius": 1},
     "cylinder": {"radius": 1, "length": 1},
@@ -65,9 +65,9 @@ def remove_unusable_shapes(model: model_repair.ModelRepair) -> None:
 def _unusable_shape_reason(shape: ElementTree.Element) -> str | None:
     inner = shape.find("geometry/*")
     kind = "" if inner is None else inner.tag.removeprefix("drake:")
-    if inner is None or kind not in _SIZE_VALUE_COUNTS_BY_SHAPE:
+    if inner is None or kind not in _NUM_SIZE_VALUES_OF_SHAPE:
         return f"{kind or 'empty'} shapes cannot be read"
-    sizes = {"radii": 3} if inner.find("radii") is not None else _SIZE_VALUE_COUNTS_BY_SHAPE[kind]
+    sizes = {"radii": 3} if inner.find("radii") is not None else _NUM_SIZE_VALUES_OF_SHAPE[kind]
     for name, count in sizes.items():
         values = parse_numbers(inner.get(name) or inner.findtext(name))
         if len(values) != count or not all(0.0 < value <= MAX_MODEL_VALUE_SI for value in values):

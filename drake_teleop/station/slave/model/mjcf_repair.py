@@ -21,7 +21,7 @@ from drake_teleop.station.slave.model.mjcf_meshes import ZERO_MASS_PROPERTIES
 
 _DRAKE_GRAVITY_M_S2, _GRAVITY_TOLERANCE_M_S2 = (0.0, 0.0, -9.81), 0.02  # [m/s^2]
 # Dynamics whose output has no range.
-_DYNTYPES_WITH_UNBOUNDED_OUTPUT = ("integrator", "muscle", "user", "dcmotor")
+_ACTUATOR_DYNTYPES_WITHOUT_LIMIT = ("integrator", "muscle", "user", "dcmotor")
 
 
 def repair_mjcf(model: model_repair.ModelRepair) -> None:
@@ -237,7 +237,7 @@ def _effort_per_control_unit(given: Attributes, tag: str) -> float:
     if tag != "general" or given.get("kind", "general") not in ("general", "motor"):
         return 0.0
     biased = given.get("biastype", "none") != "none" and any(given.numbers("biasprm", (0.0,) * 3))
-    is_unbounded = given.get("dyntype") in _DYNTYPES_WITH_UNBOUNDED_OUTPUT
+    is_unbounded = given.get("dyntype") in _ACTUATOR_DYNTYPES_WITHOUT_LIMIT
     if biased or given.get("gaintype", "fixed") != "fixed" or is_unbounded:
         return 0.0
     return abs(given.numbers("gainprm", (1.0,))[0])

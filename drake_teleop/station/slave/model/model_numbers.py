@@ -14,10 +14,10 @@ from drake_teleop.station.slave.model.model_tree import WORLD_NAME, joint_link
 # Row and column: ixx: (0, 0), ixy: (0, 1) and so on.
 _INERTIA_ENTRY_INDICES = {f"i{'xyz'[i]}{'xyz'[k]}": (i, k) for i in range(3) for k in range(i, 3)}
 # Relative changes of an inertia: rounding below the first, suspicious above the second.
-_INERTIA_ROUNDING_SHARE, _SUSPICIOUS_INERTIA_CHANGE_SHARE = 1e-3, 0.05
+_INERTIA_ROUNDING_RATIO, _SUSPICIOUS_INERTIA_CHANGE_RATIO = 1e-3, 0.05
 _INERTIA_ROUNDING_KG_M2 = 1e-15  # changes below this are rounding
 # Margin of corrected moments against rounding in Drake's check, relative to the largest one.
-_TRIANGLE_INEQUALITY_MARGIN_SHARE = 1e-9
+_PRINCIPAL_MOMENT_MARGIN_RATIO = 1e-9
 
 
 def repair_inertia_and_detect_missing(
@@ -87,11 +87,11 @@ def correct_impossible_inertia(inertia: Array, name: str, model: ModelRepair) ->
     """Return the nearest possible inertia tensor (3, 3); report a change for the link `name`."""
     nearest, change = nearest_possible_inertia(inertia)
     largest_change = change * np.abs(inertia).max()
-    if 0.0 < change <= _INERTIA_ROUNDING_SHARE or 0.0 < largest_change <= _INERTIA_ROUNDING_KG_M2:
+    if 0.0 < change <= _INERTIA_ROUNDING_RATIO or 0.0 < largest_change <= _INERTIA_ROUNDING_KG_M2:
         model.add_assumption("rounding errors in the inertia are corrected, of link", name)
     elif change:
         what = "inertia replaced by the nearest possible one (share of its largest moment) of link"
-        warning = "warning: " if change > _SUSPICIOUS_INERTIA_CHANGE_SHARE else ""
+        warning = "warning: " if change > _SUSPICIOUS_INERTIA_CHANGE_RATIO else ""
         model.add_repair(f"{warning}{what}", f"{name} ({100 * change:.3g} %)")
     return nearest
 
@@ -110,7 +110,7 @@ def nearest_possible_inertia(inertia: Array) -> tuple[Array, float]:
     if given[0] >= 0.0 and deficit <= 0.0:
         return inertia, 0.0
     moments += max(deficit, 0.0) / 3.0 * np.array([1.0, 1.0, -1.0])
-    moments[0] += _TRIANGLE_INEQUALITY_MARGIN_SHARE * largest
+    moments[0] += _PRINCIPAL_MOMENT_MARGIN_RATIO * largest
     return (axes * moments) @ axes.T, float(np.abs(moments - given).max()) / largest
 
 

@@ -65,7 +65,7 @@ class ModelRepair:
         """Root element of the file, which the repair changes in place."""
         return read_xml(self.path)
 
-    def repair_part(self, path: Path, repair: Callable[[ModelRepair], None]) -> ModelRepair:
+    def repair_file(self, path: Path, repair: Callable[[ModelRepair], None]) -> ModelRepair:
         """Repair a file that this one includes or adds; return it, and merge its assumptions."""
         purpose = self.purpose._replace(is_in_directives=True)
         part = ModelRepair(path, self.files, purpose, self.folder)

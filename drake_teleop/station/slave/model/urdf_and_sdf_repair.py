@@ -39,8 +39,8 @@ def repair_urdf(model: ModelRepair) -> None:
     _repair_links_and_joints(model, is_sdf=False)
     if not model.purpose.is_scene:
         _remove_references_to_missing_parts(root)
-        _keep_one_motor_per_joint(model)
-    _convert_meshes_and_set_text(model)
+        _keep_one_transmission_per_joint(model)
+    _convert_meshes_and_write_xml(model)
 
 
 def repair_sdf(model: ModelRepair) -> None:
@@ -54,7 +54,7 @@ def repair_sdf(model: ModelRepair) -> None:
     model.raise_faults()
     for uri in model.root.iterfind(".//include/uri"):
         _repair_included_file(uri, model)
-    _convert_meshes_and_set_text(model)
+    _convert_meshes_and_write_xml(model)
 
 
 def _remove_children_ignored_by_drake(elements: list[Element]) -> None:
@@ -70,7 +70,7 @@ def _repair_links_and_joints(model: ModelRepair, *, is_sdf: bool) -> None:
     scopes = [each for each in model.root.iter() if each.tag in ("robot", "model")]
     for scope in scopes:
         if is_sdf:
-            _attach_joints_to_links_of_frames(scope)
+            _replace_frames_of_joints_by_links(scope)
         _make_joint_and_link_names_unique(scope, model, is_sdf=is_sdf)
     chain, num_joints_to_link = _reduce_model_to_arm(scopes, model) or (set(), {})
     for scope in scopes:
@@ -89,15 +89,15 @@ def _repair_links_and_joints(model: ModelRepair, *, is_sdf: bool) -> None:
                 model.add_assumption("no inertia of", name)
 
 
-def _convert_meshes_and_set_text(model: ModelRepair) -> None:
+def _convert_meshes_and_write_xml(model: ModelRepair) -> None:
     model.raise_faults()
     remove_unusable_shapes(model)
     model.raise_faults()
-    model.dependence_reasons = find_dependence_reasons(model.root) | model.dependence_reasons
+    model.dependence_reasons = find_mimics_and_floating_links(model.root) | model.dependence_reasons
     model.text = ElementTree.tostring(model.root, encoding="unicode")
 
 
-def find_dependence_reasons(root: Element) -> dict[str, str]:
+def find_mimics_and_floating_links(root: Element) -> dict[str, str]:
     """Return texts by name: why mimic joints and floating links depend on other joints or links."""
     found: dict[str, str] = {}
     for joint in root.iter("joint"):
@@ -123,7 +123,7 @@ def _reduce_model_to_arm(
     return model_tree.reduce_to_chain(scopes[0], link, model) if link else None
 
 
-def _attach_joints_to_links_of_frames(scope: Element) -> None:
+def _replace_frames_of_joints_by_links(scope: Element) -> None:
     for joint in list_joints(scope):
         for element in (*joint.findall("parent"), *joint.findall("child")):
             name = (element.text or "").strip()
@@ -192,7 +192,7 @@ def _remove_references_to_missing_parts(root: Element) -> None:
             root.remove(group)
 
 
-def _keep_one_motor_per_joint(model: ModelRepair) -> None:
+def _keep_one_transmission_per_joint(model: ModelRepair) -> None:
     root = model.root
     moving = {x.get("name", "") for x in list_joints(root) if x.get("type") in _ONE_AXIS_TYPES}
     for motor in root.findall("transmission"):
@@ -222,7 +222,7 @@ def _repair_included_file(uri: Element, model: ModelRepair) -> None:
     uri.text = f"file://{included.resolve()}"  # or Drake uses the working folder
     repair = {".urdf": repair_urdf, ".sdf": repair_sdf}.get(included.suffix.lower())
     if repair is not None and included.is_file():
-        part = model.repair_part(included, repair)
+        part = model.repair_file(included, repair)
         model.dependence_reasons |= part.dependence_reasons
         uri.text = f"file://{model.write_file(included.name, part.text)}"
 
