@@ -33,7 +33,7 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
         - clutch: (1,) engaged if above 0.5; engaged if unconnected
         - intended_pose: (7,) X_BE that replaces the scenario's intent; may stay unconnected
         - intended_twist: (6,) twist [v; omega] of intended_pose, in B; zero if unconnected
-        - slave_state: [q; v] of the slave, for the operator's view of the tool (with a task)
+        - slave_state: [q; v] of the slave, for the operator of a task
         output_ports:
         - pose_command: (7,) X_WS, setpoint of the slave
         - leader_joints: (n,) setpoint of the slave's joints (leader arm in joint mode) [rad]

@@ -52,7 +52,7 @@ def MakeSlaveSide(
         - pose_slave: (7,) actual X_WS of the present joint angles (over a network)
         - saturated: (1,) above 0.5 while the wrench is invalid; also a signal
         - contact: (1,) 1 in contact; also a signal (with contact detection)
-        - the parts of a sample (`signal_sizes_of_sample`), slave_state, joint_torque,
+        - the sensor's signals such as measured_wrench_S, slave_state, joint_torque,
           joint_command, ik_status, scaled_wrench_S, fault: signals
         - load_estimate, contact_wrench_S (if the load is identified or estimated online): signals
         - load_state (if the load is monitored), true_contact_wrench_W (with surroundings),
@@ -61,12 +61,13 @@ def MakeSlaveSide(
         - sample, scaled_contact_and_fault: several of these signals in one port, for the log
 
     Args:
-        load_estimate, load_covariance, noise_floor: as for `MakeTeleopStation`.
+        load_estimate: (16,) Eq. (7), [offsets; phi], and `load_covariance` (16, 16) of it.
+        noise_floor: of `identify_load`, for contact detection.
         controller: custom control law of the arm (docs/station.md, "A controller of your own").
             Its output `joint_torque` (n) [N m] replaces inverse kinematics and joint control, or
-            its output `pose_command` (7) is the setpoint of both. Its input `pose_command` (7) is
-            that of this side; `slave_state` (2 n), `pose_slave` (7), `contact_wrench_S` (6) and the
-            parts of a sample are connected if it has such inputs.
+            its output `pose_command` (7) is their setpoint. It requires the input `pose_command`
+            (7); inputs `slave_state` (2 n), `pose_slave` (7), `contact_wrench_S` (6) and of the
+            sensor's signals are optional.
 
     Raises:
         DrakeTeleopError: for an unreachable start, or if load estimate or noise floor is required.
@@ -164,8 +165,8 @@ def _is_torque_controller(controller: System | None, scenario: Scenario) -> bool
 def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
     """Build the slave side without master: its joints follow an excitation trajectory.
 
-    `trajectory` runs once after the settling time. Output ports are those of `MakeSlaveSide`
-    that need neither a pose command nor force scaling.
+    `trajectory` runs once after the settling time. Output ports are those of `MakeSlaveSide` that
+    need neither a pose command nor force scaling.
     """
     builder = DiagramBuilder()
     start, _, _ = trajectory.evaluate(0.0)
@@ -187,7 +188,7 @@ def _add_slave_blocks(
     *,
     custom_torque: bool = False,
 ) -> tuple[SlavePlant, dict[str, OutputPort], float]:
-    """Add plant, servo, sensor, load estimator; return plant, sample ports, torque period [s]."""
+    """Add the blocks; return plant, sensor ports by signal, and hold time of the torque [s]."""
     rates, sensor = scenario.rates, scenario.wrist_sensor
     slave = AddSlavePlant(builder, scenario.slave, scenario.surroundings, q_start)
     arm, plant, start, ports = slave.arm, slave.plant, slave.start, slave.ports

@@ -1,4 +1,4 @@
-"""Sheet spring of the paper's Fig. 5: a leaf, clamped at one end, that the tool touches."""
+"""Sheet spring (paper, Fig. 5): a leaf, clamped at one end, that the tool touches."""
 
 from dataclasses import dataclass
 from xml.etree import ElementTree
@@ -41,7 +41,7 @@ class SheetSpring(environment.Environment):
 
     @property
     def stiffness(self) -> float:
-        """Stiffness at the free end, 3 E I / L^3 [N/m], with I = b h^3 / 12 (Euler-Bernoulli)."""
+        """Stiffness at the free end, 3 E I / L^3 [N/m]; I = width thickness^3 / 12."""
         second_moment = self.width * self.thickness**3 / 12
         return 3 * self.youngs_modulus * second_moment / self.length**3
 

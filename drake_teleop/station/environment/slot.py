@@ -2,7 +2,7 @@ r"""Chamfered slot for the tool as a peg; all parts are fixed.
 
 Section across the slot, M is the middle of its mouth, z up::
 
-    top                       top        2 sides of y_M with 3 boxes each, and the floor. A ball
+    top                       top        At +y_M and -y_M 3 boxes each, and the floor. A ball
     ------.       M       .------        on an edge of two boxes touches both, so an edge is up to
            \.     |     ./  chamfer      twice as stiff as a face. The slot is open at its ends.
              |    |    |
@@ -43,7 +43,7 @@ _PEG_BALL_COLOUR_RGBA = np.array([0.86, 0.20, 0.12, 1.0])
 @settings
 @dataclass
 class Slot(Environment):
-    """Settings of the slot: pose, shape, and contact with the balls of the peg."""
+    """Settings of the slot; the peg's collision shapes are balls."""
 
     position: list[float] = quantity([0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_W, middle of its mouth")
     yaw: float = quantity(0.0, "rad", -3.15, 3.15, "slot direction about z_W from x_W")
@@ -122,7 +122,7 @@ def _boxes_of_slot(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:
     for name, side in (("left", 1.0), ("right", -1.0)):
 
         def block(inner: float, top: float, side: float = side) -> tuple[RigidTransform, Box]:
-            """Return pose and shape of a box from y `inner` outwards and z `top` to the floor."""
+            """Return a box at y side * `inner` [m] and beyond, from z = `top` down to the floor."""
             across, height = edge + c + _SIDE_BLOCK_WIDTH_M - inner, depth + top
             middle = RigidTransform([0.0, side * (inner + across / 2), top - height / 2])
             return middle, Box(SLOT_LENGTH_M, across, height)

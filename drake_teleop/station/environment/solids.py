@@ -71,7 +71,7 @@ class Box(Surface):
 def AddFixedBox(
     plant: MultibodyPlant, name: str, X_WBox: RigidTransform, size: list[float], surface: Surface
 ) -> None:
-    """Weld a box with edges `size` (3,) [m] to the world; its shape requires a scene graph."""
+    """Weld a box with edges `size` (3,) [m] to the world, without shape if no scene graph."""
     body = plant.AddRigidBody(name, NewInstance(plant, name), SpatialInertia.Zero())
     plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WBox)
     if plant.geometry_source_is_registered():
@@ -155,7 +155,7 @@ class Block(Surface):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Exclude the tool's contact with the block's corner balls, other bodies' with its box."""
+        """Let the tool touch only the box of the block, other bodies only its corner balls."""
         bodies = [BodyIndex(index) for index in range(plant.num_bodies())]
         tool_bodies = BodiesWeldedToTool(plant, tool)
         around = [plant.get_body(index) for index in bodies if index not in tool_bodies]

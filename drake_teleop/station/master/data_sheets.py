@@ -1,4 +1,4 @@
-"""Settings of the haptic device: the paper's Phantom, data sheets by name, or a leader arm."""
+"""Settings of the haptic device: Phantom, data sheets by name, or a leader arm."""
 
 import dataclasses
 import math
@@ -25,7 +25,7 @@ _MAX_DEVICE_PITCH_RAD = 1.5
 @settings
 @dataclass
 class PhantomJointFriction:
-    """Friction torque of the Phantom's joints: coulomb * tanh(v / 0.01 rad/s) + viscous * v."""
+    """Settings of the Phantom's joint friction coulomb * tanh(v / 0.01 rad/s) + viscous * v."""
 
     # Sources as in `phantom`: main axes P, wrist estimated.
     coulomb: list[float] = quantity(
@@ -121,7 +121,7 @@ class Master:
     leader: Leader | None = None
 
     def device(self, hand_mass: float, hand_inertia: float) -> HapticDevice | LeaderDevice:
-        """Return the device's dynamics with the hand's mass [kg] and inertia about E [kg m^2]."""
+        """Return the device with the hand's mass [kg] and inertia about each axis at E [kg m^2]."""
         if self.leader is not None:
             return self.leader.device(self.position, hand_mass, hand_inertia)
         pack = partial(pack_device_parameters, hand_mass=hand_mass, hand_inertia=hand_inertia)
@@ -153,7 +153,7 @@ class Master:
         return self.leader is not None and self.leader.leads == LEADER_JOINT_MODE
 
     def check_pose_mode(self, caller: str) -> None:
-        """Raise a DrakeTeleopError about `caller` if the leader arm is in joint mode (`leads`)."""
+        """Raise DrakeTeleopError, which names `caller`, if a leader arm commands joints."""
         if self.is_joint_leader:
             what = f"{caller} cannot use a leader arm that commands joints"
             remedy = "set it to pose; the rendered force is the same"

@@ -83,7 +83,7 @@ def motor_torque_into(displayed, q, parameters, J, torque):
 def step_display(wrench, device, packed_parameters, period, J, drive):
     """Advance the force display by one `period` [s] for the wrench F_E_B (6,) to render.
 
-    `device` (27,) is output `for_display` of `MasterDevice`; its input `drive` (27,) is written.
+    `device` (27,) is the output `for_display` of the device block; `drive` (27,) its next input.
     """
     parameters = packed_parameters[0]
     q, fault = device[_JOINT_POSITIONS_SLICE], _NO_FAULT
@@ -128,8 +128,8 @@ def _fade_wrench_after_fault(device, parameters, period, drive):
 class ForceDisplay(LeafSystem):
     """Block that converts the wrench to render into motor torques of the master.
 
-    While inputs are invalid, the displayed wrench fades to zero in 50 ms; valid again, it ramps up.
-    For a leader arm, it is scaled so that motors that also compensate weight stay within limits.
+    While an input is invalid, the displayed wrench fades to zero in 50 ms, and then ramps up. For a
+    leader arm, the wrench is scaled so that motors, with weight compensation, stay within limits.
 
     .. pydrake_system::
 

@@ -41,9 +41,9 @@ _END_STOP_NATURAL_FREQUENCY_HZ = 12.0
 
 @njit(cache=True)
 def leader_acceleration_into(arm, joint_table, q, v, hand_wrench_minus_weight, motor, vdot):
-    """Write the joint accelerations (n,) [rad/s^2] of leader and hand into `vdot`.
+    """Write joint accelerations (n,) [rad/s^2] of leader and hand, for motor torques, into `vdot`.
 
-    `hand_wrench_minus_weight` (6,) is [f; tau] of the hand on E, in B, minus the hand's weight.
+    `hand_wrench_minus_weight` (6,) is [f; tau] of the hand on E, in B, without its weight.
     """
     n = q.shape[0]
     R_BE, p_BE, tau, wrench = np.empty((3, 3)), np.empty(3), np.empty(n), np.empty(6)
@@ -101,7 +101,8 @@ def limited_leader_motor_torques_into(leader, q, F, torque):
 def step_leader(leader, weight, state, pose, twist, display, hand_wrench, drive, period):
     """Advance `state` (2 n,) by one Runge-Kutta step of `period` [s]; update pose and twist.
 
-    `leader` is `LeaderDevice.compiled_constants`. The operator carries the hand's `weight` [N].
+    `leader` is `LeaderDevice.compiled_constants`, `weight` [N] the hand's, which the operator
+    carries, `display` and `drive` (27,) as in `MasterDevice`, `hand_wrench` (6,) at E, in B.
     """
     _, arm, joint_table = leader
     n = joint_table.shape[1]
@@ -132,7 +133,7 @@ def step_leader(leader, weight, state, pose, twist, display, hand_wrench, drive,
 
 @njit(cache=True)
 def limit_wrench_to_motor_torques(leader, q, wrench, limited):
-    """Write `wrench` (6,) to `limited`, scaled so that motors also carry weight within limits."""
+    """Write `wrench` (6,) to `limited`, scaled so that motors with weight keep their limits."""
     _, arm, joint_table = leader
     n = q.shape[0]
     weight, J, share = np.empty(n), np.empty((6, n)), 1.0
@@ -168,9 +169,9 @@ class LeaderDevice:
         arm: dynamics of the chain from B to E, with the hand's mass.
         arm_without_hand: dynamics without the hand, for weight compensation.
         joint_table: (8, n) rows: Coulomb friction [N m], damping in addition to the model's
-            [N m s/rad], lower and upper limits [rad], stiffness and damping of end stops, torque
-            limits [N m], share of the weight that the motors compensate.
-        home: (n,) joint positions where E has the axes of B [rad].
+            [N m s/rad], lower and upper limits [rad], stiffness [N m/rad], damping [N m s/rad] of
+            end stops, torque limits [N m], compensated share of the weight.
+        home: (n,) joint positions [rad] at which E is parallel to B.
         packed_parameters: parameters for the force display, in an array (1,).
     """
 
@@ -204,7 +205,7 @@ class LeaderDevice:
 
     @property
     def compiled_constants(self) -> tuple[Array, Array, Array]:
-        """`ArmModel.table` without the hand and with the hand; `joint_table`."""
+        """Arm tables without and with the hand, and `joint_table`."""
         return self.arm_without_hand.table, self.arm.table, self.joint_table
 
     def coordinates_for_force_display(self, q: Array) -> Array:
@@ -238,7 +239,7 @@ class LeaderDevice:
             raise DrakeTeleopError(what, where="master.leader.home", remedy=remedy)
 
     def flag_samples_at_motor_limit(self, q: Array, F: Array, share: float) -> NDArray[np.bool_]:
-        """Return flags (N,): True if a motor's torque is at least `share` of its limit.
+        """Return flags (N,): a motor's torque is at least `share` of its limit.
 
         The motors compensate the weight at joint positions q (N, n) and display F (N, 6) at E.
         """
@@ -265,10 +266,10 @@ class LeaderDevice:
 def make_leader_joint_table(
     arm: ArmModel, home: Array, coulomb: Array, viscous: Array, limit: Array, weight_share: float
 ) -> Array:
-    """Return `LeaderDevice.joint_table` (8, n); the end stops scale with the inertia at home.
+    """Return `LeaderDevice.joint_table` (8, n); end stops have 12 Hz with the inertia at home.
 
-    `coulomb` and `limit` are friction and torque limit [N m], `viscous` the damping in addition to
-    the model's [N m s/rad], each (n,); `weight_share` is the compensated share of the weight.
+    `coulomb` and `limit` (n,) are friction and torque limit [N m], `viscous` (n,) further damping
+    [N m s/rad], `weight_share` the compensated share of the weight.
     """
     inertia, w = np.diag(mass_matrix(arm, home)), 2 * np.pi * _END_STOP_NATURAL_FREQUENCY_HZ
     rows = [coulomb, viscous, arm.lower, arm.upper, w**2 * inertia, 2 * w * inertia, limit]

@@ -26,7 +26,7 @@ LEADER_JOINT_MODE = "joints"
 @settings
 @dataclass
 class Leader:
-    """Settings of a leader arm, whose base is placed so that E is at `master.position` at home."""
+    """Settings of a leader arm; its base is placed so that E is at `master.position` at home."""
 
     file: str = plain("", "URDF, SDF, MJCF or .dmd.yaml in the scenario's folder", is_path=True)
     package_paths: list[str] = plain(

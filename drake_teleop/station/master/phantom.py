@@ -7,7 +7,7 @@ downward vertical towards x_B (absolute); wrist yaw, pitch, roll.
     p_BE = Rz(q1) [l1 cos q2 + l2 sin q3, 0, l1 sin q2 - l2 cos q3]
     R_BE = Rz(q1) Ry(-q3) Rz(q4) Ry(q5) Rx(q6), singular at q5 = +-90 degrees
 
-Sources in comments: P: Cavusoglu, Feygin, Tendick 2002, as in mahilab/Phantom; D: manufacturer.
+Comments name sources: P: Cavusoglu, Feygin, Tendick 2002, from mahilab/Phantom; D: manufacturer.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def jacobian_into(q, J):
 
 @njit(cache=True)
 def joint_mass_matrix_into(q, J, hand_mass, hand_inertia, M):
-    """Write the mass matrix (6, 6) with wrist, hand and motors into M; J (6, 6) is the Jacobian."""
+    """Write the mass matrix (6, 6) with wrist, hand (inertia about each axis) and motors into M."""
     _mass_matrix_of_joints_1_to_3_into(q, M)
     for i in range(3):
         M[i, i] += _REFLECTED_MOTOR_INERTIAS_KG_M2[i]
@@ -247,7 +247,7 @@ def inverse_kinematics(pose: Array) -> Array:
 
 
 def serial_joint_angles(q: Array) -> Array:
-    """Return q (..., 6) as joint angles of the serial model `phantom.sdf`: the third is q3 - q2."""
+    """Return q (..., 6) as joint angles of `phantom.sdf`, whose third one is q3 - q2."""
     serial = np.array(q, dtype=float)
     serial[..., 2] -= serial[..., 1]
     return serial

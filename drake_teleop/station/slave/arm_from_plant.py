@@ -123,7 +123,7 @@ def _moving_joints_to_sensor(plant: MultibodyPlant, frame_S: tree.Frame) -> list
 def _bodies_moved_by_joints(
     plant: MultibodyPlant, joints: list[tree.Joint], sensor_body: tree.RigidBody
 ) -> list[list[tree.BodyIndex]]:
-    """Return, per joint, bodies that move with it but not with the next; last the load."""
+    """Return, by joint, the bodies that it moves but the next does not; the load is last."""
     outboard = [set(plant.GetBodiesKinematicallyAffectedBy([j.index()])) for j in joints]
     load = {body.index() for body in chain_joints.bodies_carried_by(plant, sensor_body)}
     rows = [inner - outer - load for inner, outer in pairwise([*outboard, set()])]
@@ -141,7 +141,7 @@ def _bodies_moved_by_joints(
 def values_per_joint(
     arm: ArmModel, values: Sequence[float], where: str, default: float | Array | None = None
 ) -> Array:
-    """Return one value per joint (n,); with a `default`, `values` may be empty or one for all."""
+    """Return values (n,); with a `default`, `values` may be empty, or one number for all joints."""
     n = arm.num_joints
     if len(values) not in ((n,) if default is None else (0, 1, n)):
         one = "" if default is None else "one for all, or "
@@ -156,8 +156,8 @@ def fill_missing_joint_limits(
 ) -> tuple[ArmModel, list[str]]:
     """Return the arm with defaults for missing joint limits, and one text per assumed default.
 
-    `acceleration` contains no, 1 or n limits [rad/s^2] that replace the model's; `hint` is appended
-    to the text about accelerations.
+    `acceleration` contains 0, 1 or n limits [rad/s^2] that replace the model's; `hint` ends the
+    text about accelerations.
     """
     assumptions = []
     slides = arm.table[:-1, IS_PRISMATIC_COLUMN] != 0.0

@@ -1,4 +1,4 @@
-"""Search and edits of joints in a parsed plant: welds, motors, and sticks for arms without shapes.
+"""Search and edits of joints in a parsed plant: welds, motors, visual sticks for missing shapes.
 
 The chain is the list of joints from the base outwards to the sensor, welds included.
 """
@@ -81,7 +81,7 @@ def weld_base_and_find_chain(
 ) -> list[Joint]:
     """Weld a free base to the world at `X_WBase` (None: identity); return the chain to `frame`.
 
-    A DrakeTeleopError is raised if a joint moves the base on the world and X_WBase is not identity.
+    A DrakeTeleopError is raised if the base moves, as on a rail, and X_WBase is not identity.
     """
     chain, X_WB = chain_to_body(plant, frame.body()), X_WBase or RigidTransform()
     base = chain[0].parent_body() if chain else frame.body()
@@ -109,7 +109,7 @@ def move_bodies_welded_to_world(
 def weld_free_bodies(
     plant: MultibodyPlant, instances: Iterable[tree.ModelInstanceIndex]
 ) -> list[str]:
-    """Weld bodies without a joint to the world; return at most one note."""
+    """Weld bodies without a joint to the world; return a text on them."""
     held = joints_by_child(plant)
     bodies = [plant.get_body(k) for each in instances for k in plant.GetBodyIndices(each)]
     free = [body for body in bodies if body.index() not in held]
@@ -142,7 +142,7 @@ def check_chain(
 def weld_held_joints(
     plant: MultibodyPlant, frame: Frame, hold: dict[str, float], joints: Iterable[tree.JointIndex]
 ) -> list[str]:
-    """Weld the joints in `hold` at the given positions [rad, m]; return one note per joint.
+    """Weld the joints in `hold` at the given positions [rad, m]; return a text per joint.
 
     Of joints with equal names, that inboard of `frame` is welded.
     """
@@ -169,7 +169,7 @@ def weld_held_joints(
 def weld_joints_outside_chain(
     plant: MultibodyPlant, joints_before: set[tree.JointIndex], chain: list[Joint]
 ) -> list[str]:
-    """Remove constraints, and weld moving joints outside `chain`; return notes.
+    """Remove constraints, and weld moving joints outside `chain`; return a text.
 
     Joints in `joints_before`, which the plant had before the model was parsed, remain.
     """
@@ -186,10 +186,10 @@ def weld_joints_outside_chain(
 def weld_load_of_link_to_sensor_frame(
     plant: MultibodyPlant, frame: Frame, chain: list[Joint]
 ) -> list[str]:
-    """Weld bodies that share a link with the sensor body to that body, so that they become load.
+    """Weld bodies beside a massless sensor body, on the same link, to it: they become load.
 
-    This applies if the sensor body is massless and welded to the link. If its origin is not that of
-    the link, the bodies remain part of the robot; the returned list then has a note on them.
+    If the sensor's origin is not that of the link, the bodies remain part of the arm, and a text
+    on them is returned.
     """
     X_LS = frame.GetFixedPoseInBodyFrame()
     for inboard in reversed(chain):
@@ -283,9 +283,9 @@ def set_torque_limits(
 def add_rotor_inertias(
     plant: MultibodyPlant, chain: list[Joint], frame: Frame, auxiliary_bodies: set[str]
 ) -> list[str]:
-    """Add a rotor inertia to each joint of the chain that moves no inertia; return notes.
+    """Add a rotor inertia to each joint that moves no inertia up to the next joint; return texts.
 
-    A joint moves the bodies up to the next joint; joints on `auxiliary_bodies` are passed over.
+    Joints beyond `auxiliary_bodies`, which the repair of the model added, do not count.
     """
     inertia = _ROTOR_INERTIA_PER_LENGTH_SQUARED_KG * _length_of_moving_chain_m(chain, frame) ** 2
     actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())

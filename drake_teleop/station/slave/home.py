@@ -28,7 +28,7 @@ _ELBOW_UP_POSTURE_RAD = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
 def solve_start_posture(
     arm: ArmModel, position: Array, R_WS: RotationMatrix = R_WS_HOME
 ) -> tuple[Array, IkStatus]:
-    """Return q (n,) [rad, m] at p_WS = `position` and `R_WS` (tool down), and `IkStatus`."""
+    """Return q (n,) [rad, m] with S at the pose `R_WS`, `position` [m], and the `IkStatus`."""
     if has_closed_form(arm):
         return nearest_branch(R_WS.matrix(), position, _ELBOW_UP_POSTURE_RAD, arm.lower, arm.upper)
     pose = np.array([*R_WS.ToQuaternion().wxyz(), *position])

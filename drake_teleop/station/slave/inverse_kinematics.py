@@ -1,7 +1,7 @@
 """Closed-form inverse kinematics of the Staubli RX90 (Pieper 1968).
 
-At q = 0 the arm points up and S is parallel to W. The wrist centre is at (x, y, z) above the
-shoulder, at the signed distance rho from the first axis. With arm lengths l2 and l3:
+At q = 0 the arm points up and S is parallel to W. The wrist centre is at the height z above the
+shoulder and at the distance rho from the first axis, negative behind it. Arm lengths are l2, l3:
 
     rho = -(l2 sin q2 + l3 sin(q2 + q3)),   z = l2 cos q2 + l3 cos(q2 + q3),
     R_WS = Rz(q1) Ry(-q2 - q3) Rz(q4) Ry(-q5) Rz(q6)."""
@@ -33,10 +33,9 @@ _JOINT_LIMIT_TOLERANCE_RAD = 1e-9
 class IkStatus(IntEnum):
     """Status of an inverse kinematics solution near a reference posture.
 
-    The texts of the members describe the closed form. The numeric method reports a singularity only
-    if it misses the pose: WRIST_SINGULAR if the last three axes are nearly coplanar, otherwise
-    SHOULDER_SINGULAR. With fewer than 6 joints, a missed pose is WRIST_SINGULAR, or OUT_OF_REACH if
-    the position error exceeds 1 mm.
+    Members are described for the closed form. The numeric method reports a singularity only for a
+    missed pose: WRIST_SINGULAR if the last three axes are nearly coplanar, else SHOULDER_SINGULAR.
+    With fewer than 6 joints: WRIST_SINGULAR, or OUT_OF_REACH for position errors above 1 mm.
     """
 
     OK = 0
@@ -175,7 +174,7 @@ def _nearest_branch_into(
 def solve_pose_command(
     pose: Array, reference: Array, lower: Array, upper: Array, max_step: float, q: Array
 ) -> int:
-    """Write the solution of `nearest_branch` for pose X_WS (7,) to q (6,); return `IkStatus`."""
+    """Write the solution nearest to `reference` for X_WS (7,) to q (6,); return `IkStatus`."""
     w, x, y, z = pose[0], pose[1], pose[2], pose[3]
     norm = w * w + x * x + y * y + z * z
     k = 2.0 / norm if norm > 0.0 else np.nan
@@ -222,8 +221,8 @@ def has_closed_form(arm: ArmModel) -> bool:
 class InverseKinematics(LeafSystem):
     """Block that converts a commanded pose to joint positions in closed form.
 
-    If each solution violates a joint limit or is over `MAX_JOINT_JUMP_RAD` from the measured
-    positions, it outputs the measured positions, clipped to the limits.
+    If each solution violates a joint limit or is over 2 rad from the measured positions, it outputs
+    these, clipped to the limits.
 
     .. pydrake_system::
 

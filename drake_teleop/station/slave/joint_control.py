@@ -1,7 +1,6 @@
 """Joint control of the slave: computed torque (paper, VI-A), or the position interface of an arm.
 
-Position interface (docs/station.md):
-command --[dead time, hold]--> target --[generator]--> reference r --[drives]--> torque
+Position interface: command --[dead time, hold]--> target --[generator]--> reference r --> torque
 
 d2r/dt2 = acceleration_per_error (target - (r + lookahead dr/dt))
 d2q/dt2 = d2r/dt2 + 2 w (dr/dt - dq/dt) + w^2 (r - q),  w = 2 pi drive_bandwidth_hz"""
@@ -32,7 +31,7 @@ COMPUTED_TORQUE_SERVO_NAME = "computed_torque"
 @settings
 @dataclass
 class PositionInterface:
-    """Settings of an arm's interface for position commands; prismatic joints have m, not rad."""
+    """Settings of a robot controller for position commands; for prismatic joints rad means m."""
 
     command_hz: float = quantity(500.0, "Hz", 1.0, 1e4, "rate of the commands")
     dead_time: float = quantity(0.004, "s", 0.0, 1.0, "command delay; multiple of 1 / command_hz")
@@ -180,13 +179,13 @@ def servo_gains_and_limits(
 
 @njit(cache=True)
 def _advance_joint_reference(command, interface, limits, memory, reference):
-    """Read the command (n,) [rad] if one is due, and advance the reference by one period.
+    """Read the command (n,) [rad] once per command period; advance the reference by a period.
 
     Args:
         interface: (6,) period [s], acceleration per error [1/s^2], lookahead [s], drive bandwidth
             [rad/s], periods per command, length of the command queue.
         limits: (2, n) speed and acceleration limits.
-        memory: updated, see `_PERIODS_SINCE_COMMAND_INDEX`.
+        memory: updated: periods since a command, queue index, target, r, dr/dt, command queue.
         reference: (3, n) output: reference position, velocity, acceleration.
     """
     period, gain, lookahead, _, periods_per_command, queue_length = interface
@@ -227,9 +226,8 @@ def position_servo_torque_into(
 ):  # fmt: skip
     """Write the motor torques (n,) for the next period, within `effort_limit` (n,) [N m].
 
-    `state` is [q; v], `scratch` (6, n), other arguments as in `_advance_joint_reference`. An
-    invalid command is replaced by the last one. If encoder readings are invalid, the torque
-    compensates gravity at the reference.
+    `state` is [q; v], `scratch` (6, n); `_advance_joint_reference` explains the others. The last
+    command replaces an invalid one. With invalid encoder readings the torque compensates gravity.
     """
     n = torque.shape[0]
     _advance_joint_reference(command, interface, limits, memory, scratch)
@@ -356,8 +354,8 @@ def servo_impedance(
     """Return stiffness K, damping D and mass of the slave at the tool, each (2,), in SI units.
 
     The first number is for translation, the second for rotation. The servo acts as the wrench K
-    (x_command - x) - D v. Mass m and inertia J are the smallest that satisfy diag(m, m, m, J, J, J)
-    >= Lambda (`operational_inertia`) in the ratio of the largest eigenvalues of its two blocks.
+    (x_command - x) - D v. Mass m and inertia J are the smallest for which diag(m, m, m, J, J, J) -
+    Lambda is positive semidefinite; m / J is the ratio of its blocks' largest eigenvalues.
     """
     config.require_computed_torque("the servo model of the passivity methods")
     inertia = operational_inertia(arm, q)

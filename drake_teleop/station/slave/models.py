@@ -134,9 +134,9 @@ def ParseModel(
 ) -> ParsedArm:
     """Parse an arm into a plant; only the joints up to S move, each with one actuator.
 
-    S is `sensor_frame`. `X_WBase` places a free base, or all links on the world. Joints in `hold`
-    are welded at the given positions [rad, m], joints beside the chain, such as a gripper's, at
-    their defaults. Unreadable or contradictory models raise DrakeTeleopError.
+    S is `sensor_frame`. `X_WBase` places a free base, or all links welded to the world. Joints in
+    `hold` are welded at these positions [rad, m], joints beside the chain at their defaults.
+    Unreadable or contradictory models raise DrakeTeleopError.
     """
     before, hold, where = set(plant.GetJointIndices()), hold or {}, str(path)
     purpose = ModelPurpose(sensor_frame, hold)
@@ -225,7 +225,7 @@ def _find_sensor_frame(
 def translate_drake_errors(
     path: Path, folder: str = "", *, is_scene: bool = False
 ) -> Iterator[None]:
-    """Convert Drake's exceptions in this context to a DrakeTeleopError that names the model file.
+    """Convert Drake's exceptions in a with-block to a DrakeTeleopError that names the model file.
 
     Messages name the original files instead of repaired copies in `folder`.
     """
@@ -250,7 +250,7 @@ def translate_drake_errors(
 
 @contextmanager
 def raise_logged_errors() -> Iterator[None]:
-    """Raise RuntimeError at the end if Drake logged an error or a message about an inertia."""
+    """Raise RuntimeError after the block if Drake logged an error or an inertia message."""
     errors: list[str] = []
 
     def collect_error_message(record: logging.LogRecord) -> bool:

@@ -56,9 +56,9 @@ _JOINT_LIMIT, _BAD_POSE, _SPEED_LIMIT = _others
 
 @njit(cache=True)
 def _pose_error_into(table, L, pose, q, x, J, e, Jt_e):
-    """Write Jacobian J (6, n), pose error e (6,) and J^T e (n,), to `Jt_e`, at q; return |e|^2.
+    """Write Jacobian J (6, n), pose error e (6,) and `Jt_e` = J^T e (n,) at q; return |e|^2.
 
-    Rotational rows of J and e are multiplied by L.
+    Rotational rows of J and e are multiplied by L [m]; x (21,) is scratch memory.
     """
     jacobian_and_pose(table, q, J, x)
     a = vectors.normalized_quaternion(vectors.quaternion_at(pose, 0))
@@ -119,7 +119,10 @@ def _is_joint_pushed_against_limit(q, lower, upper, i, push):
 
 @njit(cache=True)
 def _take_damped_step_within_limits(H, g, damping, q, lower, upper, trial):
-    """Write q + (H + damping I)^-1 g, within limits, to `trial` (n,); return the largest step."""
+    """Write q + (H + damping I)^-1 g, within limits, to `trial` (n,); return the largest step.
+
+    H (n, n) is the Gram matrix J^T J, g (n,) minus the gradient of the cost.
+    """
     n = q.shape[0]
     M, d, fixed, held = np.empty((n, n)), np.empty(n), np.zeros(n), np.empty(n, np.bool_)
     for i in range(n):

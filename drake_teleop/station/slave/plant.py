@@ -67,11 +67,10 @@ class SlavePlant:
 
     @cached_property
     def compiled_constants(self) -> tuple[Array, ...]:
-        """Argument `physics` of `contact_and_plant_rates_into`.
+        """Arrays for compiled steps of the plant (`contact_and_plant_rates_into`).
 
-        Its arrays are: `ArmModel.table` with dry friction; the load in this table, which a grasp
-        changes; compiled pairs of shapes; parameters of the sheet spring's leaf; joints of moving
-        bodies; an empty array instead of given wrenches.
+        They are: `ArmModel.table` with dry friction; a view of the load in it; compiled pairs of
+        shapes; parameters of the leaf; joints of moving bodies; no recorded wrenches.
         """
         carried = self.arm.with_load(self.arm.phi_load)
         carried.table[:-1, DRY_FRICTION_COLUMN] = self.joint_friction
@@ -81,7 +80,7 @@ class SlavePlant:
 
     @property
     def ports(self) -> dict[str, OutputPort]:
-        """Output ports of the plant, keyed by the names of the input ports that they feed."""
+        """Output ports of the plant by name of the input port that they supply."""
         plant, leaf = self.plant, self.contact.leaf_instance
         ports = {
             "slave_state": plant.get_state_output_port(self.instance),
@@ -125,7 +124,7 @@ def NominalSlave(slave: Slave) -> SlavePlant:
 
 
 class HashableByValue:
-    """Hashable copy of settings; copies with equal values and unchanged files are equal."""
+    """Hashable copy of settings; equal for equal values and modification times of `files`."""
 
     def __init__(self, value: Any, files: list[Path]) -> None:
         written = [path.stat().st_mtime_ns for path in files]
@@ -194,7 +193,7 @@ def AddSlavePlant(
 
 
 class ParsedSlave(NamedTuple):
-    """Arm and tool in a plant that is not finalized; attributes as in `SlavePlant`."""
+    """Arm and tool in a plant that is not finalized, with attributes of `SlavePlant`."""
 
     slave: Slave
     plant: MultibodyPlant

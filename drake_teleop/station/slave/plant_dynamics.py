@@ -53,7 +53,7 @@ def environment_wrench_about_Wo_into(arm, pairs, joints, applied_W, q, v, sheet,
         arm: `ArmModel.table`.
         pairs: (k, 28) pairs of shapes, `ShapePairs.compiled_pairs`.
         joints: (m, 21) joints of moving bodies, from `MakeJointTableAndRowBodies`.
-        applied_W: (6,) wrench [f; tau] that is added, about So, in W [N, N m].
+        applied_W: (6,) further wrench [f; tau], about So, in W [N, N m].
         sheet: (2,) deflection of the sheet spring's leaf, and its rate [m, m/s].
         state: the plant's [q; v], unused without joints.
     """
@@ -95,7 +95,7 @@ def environment_wrench_about_Wo_into(arm, pairs, joints, applied_W, q, v, sheet,
 
 @njit(cache=True)
 def _move_box_with_body(pair, bodies, placed):
-    """Return the pair, with a moving box at its present pose; `placed` (28,) is memory for that."""
+    """Return the pair (28,) with its box at the present pose in W; `placed` is scratch memory."""
     if pair[BOX_BODY_ROW_COLUMN] < 0.0:
         return pair
     body = bodies[int(pair[BOX_BODY_ROW_COLUMN])]
@@ -111,9 +111,9 @@ def _move_box_with_body(pair, bodies, placed):
 
 @njit(cache=True)
 def tool_proximity(arm, pairs, monitored_pairs, joints, q, sheet, state):
-    """Return PROXIMITY_NEAR_MONITORED, PROXIMITY_TOUCHING or PROXIMITY_FAR, the first that applies.
+    """Return PROXIMITY_NEAR_MONITORED if a pair of `monitored_pairs` may be closer than 2 cm.
 
-    The tool is near within 2 cm of one of `monitored_pairs`, and touches one of `pairs`.
+    Otherwise return PROXIMITY_TOUCHING if one of `pairs` touches, else PROXIMITY_FAR.
     """
     R_WS, p_WS, normal = np.empty((3, 3)), np.empty(3), np.empty(6)
     bodies, placed = np.empty((joints.shape[0], BODY_STATE_SIZE)), np.empty(NUM_PAIR_COLUMNS)
@@ -181,10 +181,10 @@ def assemble_plant_state_into(state, surroundings, x):
 
 @njit(cache=True)
 def contact_and_plant_rates_into(physics, x, tau, applied_W, wrench_W, xdot):
-    """Write xdot (2 n + 2,), the derivative of arm and leaf in x, and the contact wrench about Wo.
+    """Write xdot (2 n + 2,), the state derivative of arm and leaf, and the contact wrench about Wo.
 
     `physics` is `SlavePlant.compiled_constants`, `tau` (n,) the motor torques [N m], `applied_W`
-    (6,) a wrench that is added, about So.
+    (6,) a further wrench about So.
     """
     arm, _, pairs, _, joints, given = physics
     half = tau.shape[0] + 1
@@ -201,10 +201,10 @@ def contact_and_plant_rates_into(physics, x, tau, applied_W, wrench_W, xdot):
 
 @njit(cache=True)
 def _replay_or_request_wrench(given, x, wrench_W):
-    """Copy the next given wrench to `wrench_W` and return True; if none is left, return False.
+    """Copy the next recorded wrench to `wrench_W`; return False if it is not recorded.
 
-    `given` is empty, or a header and then wrenches (6,). The header contains the number of
-    wrenches, the number of calls, and the state x at which the first missing wrench is required.
+    The caller appends a wrench and repeats its step until none is missing. Row 0 of `given`: number
+    of wrenches, number of calls, x of the first call without a wrench; other rows: wrenches (6,).
     """
     if given.shape[0] == 0:
         return False

@@ -1,8 +1,8 @@
 """Shapes of arm, tool and surroundings at given joint positions: distances and overlaps.
 
 Collision shapes count, or visual shapes of a body without them; meshes count as convex hulls. As in
-MoveIt's setup assistant, overlaps are ignored if a joint or a telescope connects the bodies, or if
-nearly all random postures have them; an assumption lists the latter.
+MoveIt's setup assistant, overlaps are ignored if a joint or coaxial prismatic joints connect the
+bodies, or by design: if nearly all random postures have them.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class PostureShapes:
         return {each.index() for each in self.plant.GetBodiesWeldedTo(body)}
 
     def overlaps(self) -> list[tuple[RigidBody, RigidBody, float]]:
-        """Return pairs that overlap, not by design, and their distance [m] (minus the depth)."""
+        """Return pairs that overlap, not by design, and minus the depth of overlap [m]."""
         body, found = self.plant.get_body, self._overlap_distances()
         pairs = [pair for pair in found if pair not in self._by_design]
         return [(body(first), body(second), found[first, second]) for first, second in pairs]
@@ -119,7 +119,7 @@ class PostureShapes:
         return np.vstack([np.zeros((0, 3)), *hulls])
 
     def hull_points_W(self, index: BodyIndex, *, visual: bool = False) -> list[Array]:
-        """Return hull points (k, 3) in W [m] per shape: collision, or `visual` ones if any."""
+        """Return hull points (k, 3) in W [m] by collision shape, or by `visual` shape if any."""
         body, hulls = self.plant.get_body(index), self._points[index]
         if visual and (shapes := self.plant.GetVisualGeometriesForBody(body)):
             hulls = [hull_points_of(self._scene_graph.model_inspector(), each) for each in shapes]
@@ -183,7 +183,7 @@ class PostureShapes:
 
 
 def random_posture_limits(arm: ArmModel) -> tuple[Array, Array]:
-    """Return finite lower and upper limits (n,): +-pi if infinite, or if beyond both -pi and pi."""
+    """Return finite joint limits (n,): +-pi for infinite ones, or ranges beyond -pi to pi."""
     wide = arm.upper - arm.lower > 2.0 * np.pi + 1e-9
     around_zero = wide & (arm.lower <= -np.pi) & (arm.upper >= np.pi)
     finite_lower = np.where(np.isfinite(arm.lower), arm.lower, -np.pi)
@@ -227,7 +227,7 @@ def overlap_warnings(shapes: PostureShapes, *, slave_only: bool = False) -> list
 
 
 def _prepare_shapes_for_distances(plant: MultibodyPlant, scene_graph: geometry.SceneGraph) -> None:
-    """Turn visual shapes of bodies without collision shapes into such; remove unbounded shapes."""
+    """Make visual shapes the collision shapes where missing; remove unbounded shapes."""
     # Polyhedra replace curved shapes, because Drake's distance query may hang for capsules.
     inspector, source = scene_graph.model_inspector(), plant.get_source_id()
     added = []  # afterwards, because Drake's lists move when shapes are added

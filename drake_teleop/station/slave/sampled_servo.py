@@ -4,7 +4,7 @@ Each event predicts the motion, one midpoint step per sample of the controller:
 
     tau_k = servo(x_k),  x_k+1 = x_k + T f(x_k + T/2 f(x_k, tau_k), tau_k),  k = 0 .. m - 1
 
-The plant receives the torque a + b (t - h/2), with the area and first moment of these steps."""
+The plant receives the torque a + b (t - h/2) with the integral and first moment of the tau_k."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _MIN_SERVO_EVENT_HZ = 2000.0
 def servo_samples_per_event(control_hz: float, hand_hz: float) -> int:
     """Return the largest number of servo samples per event that keeps events at 2 kHz or more.
 
-    Each sample of the haptic device remains an event. Arguments are rates [Hz].
+    Events include each sample of the haptic device. Arguments are rates [Hz].
     """
     ratio = control_hz / hand_hz
     whole = round(ratio)

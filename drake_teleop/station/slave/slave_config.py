@@ -66,7 +66,7 @@ class Block:
 @settings
 @dataclass
 class Tool:
-    """Tool on the sensor: by default the paper's; `model` or `mass` replaces it."""
+    """Tool on the sensor: by default that of the paper, otherwise by `model` or `mass`."""
 
     model: str = plain("", "model file of the tool; its root is at S", is_path=True)
     mass: float = quantity(0.0, "kg", 0.0, 100.0, "mass of a tool without a model")
@@ -187,7 +187,7 @@ def AddPayload(plant: MultibodyPlant, holder: Frame, payload: Payload) -> None:
 
 
 def tip_of_tool_shapes(tool: Tool) -> list[float] | None:
-    """Return p_STip [m]: end of the farthest shape along z_S, at its centre's x and y; or None."""
+    """Return p_STip [m], the farthest shape's end along z_S; None without shapes."""
     halves = [x.radius if isinstance(x, Ball) else x.half_extent_along_z for x in tool.shapes]
     ends = [np.add(x.position, [0.0, 0.0, h]) for x, h in zip(tool.shapes, halves, strict=True)]
     return max(ends, key=lambda end: float(end[2])).tolist() if ends else None

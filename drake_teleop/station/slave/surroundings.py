@@ -25,7 +25,7 @@ _MIN_MASS_MATRIX_EIGENVALUE_SI = 1e-12  # kg or kg m^2, smallest valid eigenvalu
 
 
 class AddedEnvironment(NamedTuple):
-    """Model instances of an environment; `leaf_instance` is that of its `moving_part`, or None."""
+    """Model instances of an environment; `leaf_instance` has its sprung body, if any."""
 
     instances: Collection[tree.ModelInstanceIndex]
     leaf_instance: tree.ModelInstanceIndex | None
@@ -35,9 +35,9 @@ class ToolContactModel(NamedTuple):
     """Model of the contact between tool and environment.
 
     Attributes:
-        compiled_pairs: (k, 28) `ShapePairs.compiled_pairs`; empty if `drake_contact_reason` is set.
-        monitored_pairs: (l, 40) `ShapePairs.monitored_pairs`, computed by Drake at close range.
-        joint_table: (m, 21) from `MakeJointTableAndRowBodies`, of the boxes in `compiled_pairs`.
+        compiled_pairs: (k, 28) spheres and boxes (`ShapePairs`); empty with `drake_contact_reason`.
+        monitored_pairs: (l, 40) other shapes (`ShapePairs`), computed by Drake at close range.
+        joint_table: (m, 21) joints of moving boxes, from `MakeJointTableAndRowBodies`.
         plant_state_size: size of the plant's state, 0 without joints.
         drake_contact_reason: why Drake's contact results replace the compiled law, or empty.
         tool_bodies, tool_shapes: indices of the tool's bodies, identifiers of their shapes.

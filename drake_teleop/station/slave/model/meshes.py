@@ -35,9 +35,9 @@ _STL_TRIANGLE_DTYPE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3))
 def remove_unusable_shapes(model: model_repair.ModelRepair) -> None:
     """Remove shapes that Drake cannot read, or all shapes if the plant has no SceneGraph.
 
-    Relative mesh addresses become absolute. STL meshes are converted to convex hulls, because Drake
-    does not read STL. Removed shapes of links that keep none are reported, removed collision shapes
-    also of tools, of scenes, and of links that keep other collision shapes.
+    Relative mesh addresses become absolute. STL meshes, which Drake does not read, become convex
+    hulls. Reported are removed shapes of links that keep none, and removed collision shapes of
+    tools, scenes and links that keep other ones.
     """
     lost, purpose = dict[str, list[str]](), model.purpose
     for link in model.root.iter("link"):

@@ -60,7 +60,7 @@ class Geom:
 
 @dataclass(eq=False)
 class Body:
-    """Body with pose X_PB in its parent; `generator_tags` are unsupported tags that add bodies."""
+    """Body with pose X_PB in its parent; `generator_tags`: unsupported tags such as replicate."""
 
     name: str
     X_PB: RigidTransform
@@ -217,7 +217,7 @@ class BodyReader:
 
 
 class MjcfWriter:
-    """Writer of MJCF text; bodies at the top of a tool get free joints.
+    """Writer of MJCF text; root bodies of a tool get free joints, or Drake would fix them.
 
     Contact meshes become convex hulls, as in MuJoCo, except in a scene.
     """

@@ -29,7 +29,7 @@ _MAIN_DEFAULT_CLASS = "main"  # name of the class at the top
 
 
 class Attributes(dict[str, str]):
-    """Attributes of one XML element; `label` names it in faults, which are added to `model`."""
+    """Attributes of one XML element, which faults in `model` call `label`."""
 
     def __init__(self, values: dict[str, str], label: str, model: ModelRepair) -> None:
         super().__init__(values)
@@ -38,7 +38,7 @@ class Attributes(dict[str, str]):
     def numbers(
         self, name: str, default: tuple[float, ...], max_magnitude: float = math.inf
     ) -> list[float]:
-        """Return the numbers in attribute `name`; last ones of `default` supply missing ones."""
+        """Return numbers of attribute `name`, filled from `default`; report above max_magnitude."""
         values, fault = parse_numbers(self.get(name)), ""
         if not all(map(math.isfinite, values)):
             fault = "is not a list of numbers"
@@ -69,8 +69,8 @@ class Attributes(dict[str, str]):
     def read_range(self, name: str, flag: str, *, autolimits: bool) -> tuple[float, float] | None:
         """Return the limits (lower, upper) in attribute `name`, or None if they are switched off.
 
-        Attribute `flag` switches them: true, false, or auto (the default). With auto, limits of
-        nonzero width apply if `autolimits` of the compiler element is true.
+        Attribute `flag` switches them: true, false, or auto (the default): limits apply if they
+        differ and `autolimits` of the compiler element is true.
         """
         lower, upper = self.numbers(name, (0.0, 0.0))
         limited = self.get(flag, "auto")
@@ -103,7 +103,7 @@ class Mjcf:
             self._add_defaults(element, _MAIN_DEFAULT_CLASS, self._defaults[_MAIN_DEFAULT_CLASS])
 
     def find_file(self, element: Element, name: str, folder: str) -> Path | None:
-        """Return `folder`/`name` beside the main file or that of `element`; None if missing."""
+        """Return `folder`/`name` beside the main file or the file of `element`, or None."""
         places = [self.model.path.resolve().parent, self._folders.get(element)]
         find = self.model.files.find_file
         found = (find(name, place / folder) for place in places if place)

@@ -144,7 +144,7 @@ def _insert_sensor_frame_at_site(body: Body, site: str, *, is_force_sensor_site:
 def _weld_other_joints_and_list_moving(
     world: Body, chain: list[Body], model: model_repair.ModelRepair
 ) -> list[Joint]:
-    """Weld free bodies and joints outside the chain; return the moving joints without held ones."""
+    """Weld free bodies and joints outside the chain; return joints that still move."""
     moving = list[Joint]()
     for body in world.with_descendants():
         joints, body.joints = body.joints, []

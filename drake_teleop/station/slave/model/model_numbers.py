@@ -26,7 +26,7 @@ def repair_inertia_and_detect_missing(
     """Replace impossible inertia of a link by the nearest possible; return True if none is given.
 
     Changes and faults are reported. If no joint of the arm moves the link (`is_fixed`), impossible
-    inertia is removed, and zero inertia counts as given.
+    inertia is removed, and the result is False.
     """
     name, inertial = link.get("name", ""), link.find("inertial")
     mass_element = link.find("inertial/mass")
@@ -99,9 +99,9 @@ def correct_impossible_inertia(inertia: Array, name: str, model: ModelRepair) ->
 def nearest_possible_inertia(inertia: Array) -> tuple[Array, float]:
     """Return the nearest possible inertia tensor (3, 3) about the centre of mass, and the change.
 
-    Negative principal moments become 0. Then a deficit of p3 <= p1 + p2 is distributed in equal
-    parts, which is nearest in the Frobenius norm. The change is the largest difference of a
-    principal moment, divided by the largest moment; it is 0 for a possible tensor.
+    Negative principal moments become 0. Then an excess of p3 over p1 + p2 is distributed equally,
+    which is nearest in the Frobenius norm. The change is the largest difference of a principal
+    moment, divided by the largest moment.
     """
     given, axes = np.linalg.eigh((inertia + inertia.T) / 2.0)
     moments = np.maximum(given, 0.0)

@@ -76,7 +76,7 @@ class ModelFiles:
         self._bases = {""}
 
     def merge_packages_with_map(self, known: PackageMap) -> None:
-        """Merge `packages` and Drake's map `known` into both; omit Drake's downloaded models."""
+        """Add `packages` to Drake's map `known`, and its packages to them, without drake_models."""
         known.Remove("drake_models")
         for name, folder in self.packages.items():
             if known.Contains(name):  # the model's package replaces Drake's
@@ -151,7 +151,7 @@ class ModelFiles:
         return self.sizes[real]
 
     def mesh_files(self) -> Iterator[Path]:
-        """Yield readable meshes, with their textures; call `check_referenced_files` before."""
+        """Yield readable meshes with textures, after `check_referenced_files` found the files."""
         texts = [path for path in self.sizes if path.suffix.lower() in _XML_SUFFIXES]
         for mesh in [m for path in texts for m in self._referenced_files(path, with_meshes=True)]:
             if not self.file_access_fault(mesh, "meshes"):

@@ -41,8 +41,8 @@ def reduce_to_chain(
     """Keep only the tree of links with the sensor; fix joints that are not between root and sensor.
 
     Joints that close a loop are removed. Held joints count as fixed. Return the joints from root to
-    sensor link, fixed ones included, and by link the number of moving joints from root to link; or
-    None, with a fault, if joints are ambiguous.
+    sensor link, fixed ones included, and by link the number of moving joints to it; or None, with a
+    fault, if a link has two parents.
     """
     joints = _joint_chain_to_link(scope, sensor_link, model)
     if joints is None:

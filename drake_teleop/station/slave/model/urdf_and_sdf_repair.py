@@ -98,7 +98,7 @@ def _convert_meshes_and_write_xml(model: ModelRepair) -> None:
 
 
 def find_mimics_and_floating_links(root: Element) -> dict[str, str]:
-    """Return texts by name: why mimic joints and floating links depend on other joints or links."""
+    """Return, by name of mimic joint or floating link, on which part it depends."""
     found: dict[str, str] = {}
     for joint in root.iter("joint"):
         parent = joint_link(joint, "parent")
@@ -212,7 +212,7 @@ def _keep_one_transmission_per_joint(model: ModelRepair) -> None:
 
 
 def _repair_included_file(uri: Element, model: ModelRepair) -> None:
-    """Replace an include's address by the absolute path of its file, or of the repaired copy."""
+    """Replace the address in an include by the absolute path of the file or repaired copy."""
     address = (uri.text or "").strip()
     included = _find_included_model_file(address, model)
     if included is None:  # Drake searches in more places, and crashes on a circle through them
