@@ -34,8 +34,8 @@ _BLOCK_COLOUR_RGBA = np.array([0.30, 0.42, 0.58, 1.0])
 class Surface(Environment):
     """Base class of objects with contact stiffness, dissipation and friction of their surface.
 
-    In contact, Drake combines the stiffnesses of surface and tool as springs in series, and takes
-    the harmonic mean of their frictions. The tool's ball has stiffness 4e5 N/m and friction 0.2.
+    Contact has the stiffnesses of surface and tool in series, and the harmonic mean of their
+    frictions. The tool's ball has stiffness 4e5 N/m and friction 0.2.
     """
 
     stiffness: float = quantity(

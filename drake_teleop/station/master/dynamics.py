@@ -1,7 +1,4 @@
-"""Compiled dynamics of a haptic device with base frame B and stylus frame E.
-
-`device` is a record of `DEVICE_DTYPE`.
-"""
+"""Compiled dynamics of a haptic device, a `DEVICE_DTYPE` record; B: base frame, E: stylus frame."""
 
 from __future__ import annotations
 

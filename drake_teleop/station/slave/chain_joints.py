@@ -144,7 +144,7 @@ def weld_held_joints(
 ) -> list[str]:
     """Weld the joints in `hold` at the given positions [rad, m]; return a text per joint.
 
-    Of joints with equal names, that inboard of `frame` is welded.
+    Of joints with one name, that inboard of `frame` is welded.
     """
     ordered = *map(plant.get_joint, joints), *chain_to_body(plant, frame.body())
     known = {joint.name(): joint for joint in ordered if joint.num_velocities() > 0}
@@ -171,7 +171,7 @@ def weld_joints_outside_chain(
 ) -> list[str]:
     """Remove constraints, and weld moving joints outside `chain`; return a text.
 
-    Joints in `joints_before`, which the plant had before the model was parsed, remain.
+    `joints_before`, which the plant had before the model, remain.
     """
     for constraint in plant.GetConstraintIds():  # for example of coupled fingers
         plant.RemoveConstraint(constraint)

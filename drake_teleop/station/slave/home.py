@@ -1,4 +1,4 @@
-"""Start posture of the arm, by default with the tool pointing down."""
+"""Start posture of the arm, by default with the tool down."""
 
 from __future__ import annotations
 

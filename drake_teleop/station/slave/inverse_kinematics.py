@@ -195,9 +195,9 @@ def nearest_branch(
 ) -> tuple[Array, IkStatus]:
     """Return the solution within the limits nearest to a reference (6,) [rad], and the `IkStatus`.
 
-    Solutions in which a joint is over `max_step` [rad] from the reference are discarded. A wrist
-    centre out of reach is replaced by the nearest one in reach. Without a solution, the reference,
-    clipped to the limits, is returned.
+    Solutions with a joint over `max_step` [rad] from the reference are discarded. A wrist centre
+    out of reach is replaced by the nearest one in reach. Without a solution, the clipped reference
+    is returned.
     """
     q = np.empty(6)
     # Drake's matrices are stored by columns; one layout avoids a second compilation.

@@ -149,9 +149,9 @@ class JointControlConfig:
 def computed_torque_into(table, command, state, kp, kv, speed_limit, effort_limit, scratch, torque):
     """Write the computed torque (n,) [N m], tau = ID(q, v, kv (clip(kp (q_command - q)) - v)).
 
-    ID is the inverse dynamics, `state` [q; v]. The joint speed kp (q_command - q) is clipped to
-    `speed_limit`, and tau to `effort_limit`. Invalid encoder readings give gravity compensation at
-    the commanded posture. An invalid command leaves the torque unchanged.
+    ID is the inverse dynamics, `state` [q; v]. The inner clip is to `speed_limit`; tau is clipped
+    to `effort_limit`. Invalid encoder readings give gravity compensation at the commanded posture.
+    An invalid command keeps the torque.
     """
     if not are_valid_port_values(command):
         return

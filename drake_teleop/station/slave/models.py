@@ -192,9 +192,9 @@ def ParseTool(
 
 
 def ParseScene(plant: MultibodyPlant, path: Path) -> list[str]:
-    """Parse surroundings; return texts about data that are assumed or have no effect.
+    """Parse surroundings; return texts about assumed or ineffective data.
 
-    A DrakeTeleopError is raised for mimic joints and for links that float on other links.
+    Mimic joints and links that float on links raise DrakeTeleopError.
     """
     instances, model = repair_and_parse_model(plant, path, (), ModelPurpose(is_scene=True))
     for name, what in model.dependence_reasons.items():

@@ -359,8 +359,8 @@ def _follow_command(
 class NumericInverseKinematics(LeafSystem):
     """Block that converts a commanded pose to joint positions, for any serial arm.
 
-    Its ports are those of `InverseKinematics`. Joints continue from the last command, not from the
-    measured position, so that a redundant arm does not drift towards another posture.
+    Its ports are those of `InverseKinematics`. Joints continue from the last command, not the
+    measured position, so that a redundant arm does not drift.
     """
 
     __slots__ = NO_EXTRA_SLOTS

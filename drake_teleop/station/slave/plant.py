@@ -49,7 +49,7 @@ class SlavePlant:
         start: (n,) joint positions at the start [rad].
         X_WS_start: (7,) pose at the start [qw qx qy qz px py pz].
         tip: (3,) p_STip, contact point of the tool [m].
-        assumptions: texts about data that the models do not have.
+        assumptions: texts about missing data of the models.
     """
 
     plant: MultibodyPlant

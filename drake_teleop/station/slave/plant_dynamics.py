@@ -1,4 +1,4 @@
-"""Dynamics of arm, leaf and contact inside a time step: compiled, or with Drake's contact results.
+"""Dynamics of arm, leaf and contact in a time step: compiled, or with Drake's contact results.
 
 The state x is [q, leaf deflection, v, leaf speed], then the plant's [q; v] if other bodies move.
 The compiled contact law covers spheres on boxes; Drake's law covers all shapes and contact models.
@@ -141,8 +141,7 @@ def add_force_to_wrench(wrench_W, p_WC, force_W):
 class ToolContact(LeafSystem):
     """Block that outputs the environment's wrench (6,) on the tool about the world's origin.
 
-    The port sheet_state [z; v_z] exists only with a leaf, plant_state [q; v] only with other moving
-    bodies.
+    Ports sheet_state [z; v_z] and plant_state [q; v] exist with a leaf, with other moving bodies.
     """
 
     __slots__ = NO_EXTRA_SLOTS
@@ -275,7 +274,7 @@ class DrakeContact(LeafSystem):
 
 
 class ContactPlantCopy:
-    """Copy of the slave's plant that computes contact at any state, beside the simulated plant."""
+    """Copy of the slave's plant that computes contact at any state."""
 
     def __init__(self, config: Slave, environment: Environment | None, q_start: Array) -> None:
         builder = DiagramBuilder()

@@ -47,13 +47,13 @@ class PostureShapes:
     """Shapes of a slave and its surroundings in a plant, for overlaps at any joint positions.
 
     Args:
-        sticks: whether an arm without shapes gets sticks as shapes.
+        sticks: whether sticks replace all missing shapes of an arm.
 
     Attributes:
-        assumptions: texts about data that the models do not have.
+        assumptions: texts about missing data of the models.
         tool_body, tool_bodies: indices of the body on the sensor, and of all bodies beyond it.
         surroundings: indices of the bodies of the environment.
-        has_sticks: whether sticks replace the missing shapes.
+        has_sticks: whether they do.
     """
 
     def __init__(

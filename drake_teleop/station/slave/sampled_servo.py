@@ -55,8 +55,7 @@ def predict_torque_ramp(arm, command, state, sheet, servo, physics, samples, per
         servo: gains and limits from `servo_gains_and_limits`.
         physics: `SlavePlant.compiled_constants`.
         period: period of the servo [s].
-        ramp: (3 n,) output: torque now [N m], its rate [N m/s], torque at the last predicted
-            sample [N m].
+        ramp: (3 n,) output: torque now [N m], its rate [N m/s], last predicted torque [N m].
     """
     n = command.shape[0]
     kp, kv, speed_limit, effort_limit = servo

@@ -23,7 +23,7 @@ _TOOL_MESH_EDGE_LENGTH_M = 0.005  # m, edge length of the mesh of the tool's bal
 @settings
 @dataclass
 class Scene(Environment):
-    """Surroundings from a file, with pose, and point or hydroelastic contact."""
+    """Surroundings from a file, with point or hydroelastic contact."""
 
     file: str = plain(
         "door.sdf", "SDF, URDF, .dmd.yaml in scenario's folder; built in: door.sdf", is_path=True

@@ -1,4 +1,4 @@
-"""Settings of the slave in a scenario: arm, base pose, start, tool and payload."""
+"""Settings of the slave: arm, base pose, start, tool and payload."""
 
 import math
 from dataclasses import dataclass, field
@@ -98,7 +98,7 @@ class Tool:
 @settings
 @dataclass
 class Payload:
-    """Payload: a ball of steel, welded to the tool, without a collision shape; part of the load."""
+    """Payload: a steel ball, welded to the tool, without collision shape; part of the load."""
 
     mass: float = quantity(0.0, "kg", 0.0, 10.0, "mass of the payload; 0: none")
     com: list[float] = quantity([0.0, 0.0, 0.15], "m", -0.5, 0.5, "centre of mass, p_SoBcm_S")
@@ -177,7 +177,7 @@ class Slave:
 
 
 def AddPayload(plant: MultibodyPlant, holder: Frame, payload: Payload) -> None:
-    """Weld the payload, if it has mass, to `holder`, a frame that coincides with S."""
+    """Weld a payload with mass to `holder`, a frame that coincides with S."""
     if payload.mass == 0.0:
         return
     inertia = SpatialInertia.SolidSphereWithMass(payload.mass, steel_ball_radius(payload.mass))

@@ -42,7 +42,7 @@ class ToolContactModel(NamedTuple):
         drake_contact_reason: why Drake's contact results replace the compiled law, or empty.
         tool_bodies, tool_shapes: indices of the tool's bodies, identifiers of their shapes.
         leaf_parameters: (4,) mass [kg], stiffness [N/m], damping [N s/m], gravity [m/s^2].
-        leaf_instance: model instance of the leaf, or of another `moving_part`; None without one.
+        leaf_instance: model instance of the leaf or another `moving_part`, or None.
         moving_bodies: indices of other moving bodies, by name.
     """
 
@@ -78,8 +78,8 @@ def MakeToolContactModel(
 ) -> ToolContactModel:
     """Return the contact model of tool and environment, in a finalized plant.
 
-    `scene_graph` contains the shapes of tool and environment only. A DrakeTeleopError is raised for
-    hydroelastic contact without hydroelastic shapes, or a moving body without mass.
+    `scene_graph` contains only shapes of tool and environment. A DrakeTeleopError is raised for
+    hydroelastic contact without hydroelastic shapes, or moving bodies without mass.
     """
     environment.PrepareContact(plant, scene_graph, tool)
     shapes, context = ToolShapes(plant, scene_graph, tool), plant.CreateDefaultContext()
@@ -150,7 +150,7 @@ def MovingBodiesExceptLeaf(
 
 
 def supports_pose_conversion(joint: tree.Joint) -> bool:
-    """Return whether `joint_positions_of_pose` supports the type of the joint."""
+    """Return whether `joint_positions_of_pose` supports the joint."""
     kinds = (tree.RevoluteJoint, tree.PrismaticJoint, tree.QuaternionFloatingJoint)
     return joint.num_positions() == 0 or isinstance(joint, kinds)
 

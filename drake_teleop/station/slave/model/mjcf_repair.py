@@ -125,8 +125,8 @@ def _split_into_one_joint_bodies(body: Body) -> Body:
 def _insert_sensor_frame_at_site(body: Body, site: str, *, is_force_sensor_site: bool) -> None:
     """Add a massless body as sensor frame, at the pose of a site on a descendant of `body`.
 
-    If a `force` or `torque` sensor measures at the site (`is_force_sensor_site`), the new body
-    becomes the parent of the site's body, otherwise its child.
+    If a force or torque sensor is at the site (`is_force_sensor_site`), the new body becomes the
+    parent of the site's body, otherwise its child.
     """
     for k, child in enumerate(body.children):
         X_BS = child.sites.pop(site, None)

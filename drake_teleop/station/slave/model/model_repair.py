@@ -25,10 +25,10 @@ class ModelPurpose(NamedTuple):
     Attributes:
         sensor_name: frame, link or site of the sensor; empty for tools and surroundings.
         held_positions: angles or positions [rad, m] of joints that do not move.
-        is_tool: whether the model is a tool, whose joints are all fixed.
-        is_scene: whether the model is surroundings; then shapes that are not readable are faults.
-        is_in_directives: whether another file adds the model; then every link is kept.
-        plant_has_shapes: whether the plant has a SceneGraph.
+        is_tool: the model is a tool, whose joints are all fixed.
+        is_scene: the model is surroundings; unreadable shapes are faults.
+        is_in_directives: another file adds the model; every link is kept.
+        plant_has_shapes: the plant has a SceneGraph.
     """
 
     sensor_name: str = ""
