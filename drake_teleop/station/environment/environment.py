@@ -146,13 +146,13 @@ def ExcludeContact(
 
 
 def ContactMaterial(
-    stiffness: float, dissipation: float, friction: float, old: ProximityProperties | None = None
+    stiffness: float, dissipation: float, friction: float, former: ProximityProperties | None = None
 ) -> ProximityProperties:
-    """Return properties for point contact; hydroelastic ones are copied from `old`.
+    """Return properties for point contact; hydroelastic ones are copied from `former`.
 
     Units: stiffness [N/m], Hunt-Crossley dissipation [s/m], friction coefficient [1].
     """
-    properties = ProximityProperties(old or ProximityProperties())
+    properties = ProximityProperties(former or ProximityProperties())
     for name in ("point_contact_stiffness", "hunt_crossley_dissipation", "coulomb_friction"):
         properties.RemoveProperty("material", name)
     law = CoulombFriction(friction, friction)

@@ -97,7 +97,7 @@ def FindContactPairs(
                 X_SShape = X_SOwn @ inspector.GetPoseInFrame(own)
                 try:
                     sphere, edges = _require_sphere_and_box(inspector, own, other)
-                    law = _combined_contact_law_parameters(inspector, own, other)
+                    law = _stiffness_damping_and_frictions(inspector, own, other)
                     last = [direction, law, [slip_speed, row]]
                     place, half = [X_SShape.translation(), [sphere.radius()]], edges.size() / 2
                     compiled_pairs.append(_make_pair_row(place, X_Other, half, last))
@@ -151,7 +151,7 @@ def _prismatic_joint_direction_W(plant: MultibodyPlant, context: Context, body: 
     return np.zeros(3)
 
 
-def _combined_contact_law_parameters(
+def _stiffness_damping_and_frictions(
     inspector: SceneGraphInspector, ball: GeometryId, box: GeometryId
 ) -> list[float]:
     names = "point_contact_stiffness", "hunt_crossley_dissipation", "coulomb_friction"

@@ -112,8 +112,8 @@ class Slot(Environment):
             scene_graph.AssignRole(source, ball, material, RoleAssign.kReplace)
 
 
-def _slot_material(slot: Slot, old: ProximityProperties | None = None) -> ProximityProperties:
-    return ContactMaterial(2 * slot.stiffness, slot.dissipation, slot.friction, old)
+def _slot_material(slot: Slot, former: ProximityProperties | None = None) -> ProximityProperties:
+    return ContactMaterial(2 * slot.stiffness, slot.dissipation, slot.friction, former)
 
 
 def _boxes_of_slot(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:

@@ -151,7 +151,7 @@ def limit_wrench_to_motor_torques(leader, q, wrench, limited):
 
 
 @njit(cache=True)
-def _flag_samples_with_motor_at_limit(leader, q, F, torque_share):
+def _flag_samples_at_motor_limit(leader, q, F, torque_share):
     rows, n = q.shape
     flags, torque = np.zeros(rows, np.bool_), np.empty(n)
     for row in range(rows):
@@ -244,7 +244,7 @@ class LeaderDevice:
         The motors compensate the weight at joint positions q (N, n) and display F (N, 6) at E.
         """
         constants = self.compiled_constants
-        return np.asarray(_flag_samples_with_motor_at_limit(constants, q.copy(), F.copy(), share))
+        return np.asarray(_flag_samples_at_motor_limit(constants, q.copy(), F.copy(), share))
 
     def flag_samples_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
         return ((q < self.joint_table[_MIN_Q_ROW]) | (q > self.joint_table[_MAX_Q_ROW])).any(axis=1)

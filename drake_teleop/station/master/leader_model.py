@@ -80,7 +80,7 @@ class Leader:
         frame = parsed.sensor_frame
         arm = ArmModelFromPlant(plant, frame.model_instance(), frame.name())
         home = self._home_joint_positions(arm)
-        arm_without_hand = _with_end_frame_E_placed_at_home(arm, home, np.array(position))
+        arm_without_hand = _place_end_frame_E_at_home(arm, home, np.array(position))
         phi = arm_without_hand.phi_load
         phi[0] += hand_mass
         phi[[4, 7, 9]] += hand_inertia
@@ -106,7 +106,7 @@ class Leader:
         return np.where(within, 0.0, arm.middle_positions)
 
 
-def _with_end_frame_E_placed_at_home(arm: ArmModel, home: Array, p_BE: Array) -> ArmModel:
+def _place_end_frame_E_at_home(arm: ArmModel, home: Array, p_BE: Array) -> ArmModel:
     # The base moves so that E is at p_BE (3,) at home.
     R, p = np.empty((3, 3)), np.empty(3)
     serial_arm.forward_kinematics(arm.table, home, R, p)

@@ -166,7 +166,7 @@ def acceleration_from_specific_force_into(table: Array, q: Array, s: Array, out:
 
 
 @njit(cache=True, inline="always")
-def _write_base_motion_with_minus_gravity(table: Array, x: Array) -> None:
+def _start_motion_at_rest_with_minus_gravity(table: Array, x: Array) -> None:
     x[:] = 0.0
     for k in range(3):
         x[k] = -table[table.shape[0] - 1, LAST_ROW_GRAVITY_COLUMN + k]
@@ -219,7 +219,7 @@ def jacobian_and_pose(table: Array, q: Array, J_out: Array, x: Array) -> None:
 def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
     """Write the motion x of S to out (21,), but with s, omega, alpha in S instead of W."""
     n = table.shape[0] - 1
-    _write_base_motion_with_minus_gravity(table, out)
+    _start_motion_at_rest_with_minus_gravity(table, out)
     for row in range(n + 1):
         qi, vi, ai = (q[row], v[row], vdot[row]) if row < n else (0.0, 0.0, 0.0)
         _propagate_motion_to_child_link(table, row, qi, vi, ai, out)
@@ -232,7 +232,7 @@ def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> 
 def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
     """Write the states x of all links and of S to out (n+1, 21)."""
     n = table.shape[0] - 1
-    _write_base_motion_with_minus_gravity(table, out[0])
+    _start_motion_at_rest_with_minus_gravity(table, out[0])
     for row in range(n + 1):
         if row > 0:
             out[row] = out[row - 1]
@@ -284,7 +284,7 @@ def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Arr
     n = table.shape[0] - 1
     x = np.empty(21)
     link = np.empty((n + 1, 12))
-    _write_base_motion_with_minus_gravity(table, x)
+    _start_motion_at_rest_with_minus_gravity(table, x)
     for row in range(n + 1):
         qi, vi, ai = (q[row], v[row], vdot[row]) if row < n else (0.0, 0.0, 0.0)
         _propagate_motion_to_child_link(table, row, qi, vi, ai, x)
@@ -370,7 +370,7 @@ def forward_dynamics(
     link = np.empty((n + 1, 12))
     inertia = np.zeros((n + 1, 10))
     M = np.empty((n, n))
-    _write_base_motion_with_minus_gravity(table, x)
+    _start_motion_at_rest_with_minus_gravity(table, x)
     for row in range(n + 1):
         qi, vi = (q[row], v[row]) if row < n else (0.0, 0.0)
         _propagate_motion_to_child_link(table, row, qi, vi, 0.0, x)

@@ -340,15 +340,15 @@ def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:
     for joint in reversed(chain_to_body(plant, sensor_frame.body())):
         start, frame = _frame_origin_in_body(joint.frame_on_child()), joint.frame_on_parent()
         if not isinstance(joint, WeldJoint):
-            _add_skeleton_capsule(plant, joint.child_body(), start, p_BEnd)
+            _add_visual_capsule(plant, joint.child_body(), start, p_BEnd)
             p_BEnd = _frame_origin_in_body(frame)
             continue
         if joint.parent_body().index() == plant.world_body().index():
-            _add_skeleton_capsule(plant, joint.child_body(), np.zeros(3), p_BEnd)
+            _add_visual_capsule(plant, joint.child_body(), np.zeros(3), p_BEnd)
         p_BEnd = _pose_of_welded_child_in_parent(joint) @ p_BEnd
 
 
-def _add_skeleton_capsule(plant: MultibodyPlant, body: RigidBody, start: Array, end: Array) -> None:
+def _add_visual_capsule(plant: MultibodyPlant, body: RigidBody, start: Array, end: Array) -> None:
     if plant.GetVisualGeometriesForBody(body):
         return
     length = float(np.linalg.norm(end - start))

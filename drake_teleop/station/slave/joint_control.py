@@ -247,7 +247,7 @@ def position_servo_torque_into(
         torque[i] = min(max(torque[i], -effort_limit[i]), effort_limit[i])
 
 
-def _interface_constants_and_memory(
+def _position_servo_constants_and_memory(
     arm: ArmModel, interface: PositionInterface, period: float, q_start: Array
 ) -> tuple[tuple[Array, ...], Array]:
     n, queued = arm.num_joints, round(interface.dead_time * interface.command_hz)
@@ -296,7 +296,7 @@ class JointControl(LeafSystem):
             self._constants = (*servo_gains_and_limits(arm, config), np.zeros(3 * n))
         else:
             self._servo, self._groups = position_servo_torque_into, [1, 0]
-            arguments = _interface_constants_and_memory(arm, interface, period, q_start)
+            arguments = _position_servo_constants_and_memory(arm, interface, period, q_start)
             self._constants, memory = arguments
             self.DeclareDiscreteState(memory)
 

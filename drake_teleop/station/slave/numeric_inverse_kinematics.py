@@ -44,7 +44,7 @@ _MIN_OUT_OF_REACH_ERROR_M = 5e-6
 _MIN_OUT_OF_REACH_SEARCH_ERROR_M = 1e-3
 # The same for the position [m] of an arm with fewer than 6 joints, which always misses a part of
 # the orientation. 1 mm is visible at the tool, and about the repeatability of small arms.
-_MIN_OUT_OF_REACH_ERROR_FEW_JOINTS_M = 1e-3
+_MIN_OUT_OF_REACH_ERROR_BELOW_6_DOF_M = 1e-3
 # Largest joint displacement to escape from a singularity [rad, m].
 _MAX_SINGULARITY_ESCAPE_RAD_OR_M, _SEARCH_SINGULARITY_ESCAPE_RAD_OR_M = 0.05, 0.3
 # Triple product of the last three axes below which the wrist is singular.
@@ -209,7 +209,7 @@ def follow_pose(
     _gram_matrix_of_size_into(J, B)
     damping = max(min_singular_value * min_singular_value - _find_smallest_eigenpair(B, u), 0.0)
     before, missed, expected_gain = np.inf, 0.0, 0.0
-    limit = _MIN_OUT_OF_REACH_ERROR_FEW_JOINTS_M if n < 6 else _MIN_OUT_OF_REACH_ERROR_M
+    limit = _MIN_OUT_OF_REACH_ERROR_BELOW_6_DOF_M if n < 6 else _MIN_OUT_OF_REACH_ERROR_M
     while True:
         anchor = q.copy()
         cost, relative_damping, stalled_steps, better = squared, _INITIAL_RELATIVE_DAMPING, 0, True

@@ -185,11 +185,11 @@ def contact_and_plant_rates_into(physics, x, tau, applied_W, wrench_W, xdot):
     `physics` is `SlavePlant.compiled_constants`, `tau` (n,) the motor torques [N m], `applied_W`
     (6,) a further wrench about So.
     """
-    arm, _, pairs, _, joints, given = physics
+    arm, _, pairs, _, joints, recorded = physics
     half = tau.shape[0] + 1
     q, v = x[: half - 1], x[half : 2 * half - 1]
     sheet, rest = x[half - 1 : 2 * half : half], x[2 * half :]
-    if not _replay_or_request_wrench(given, x, wrench_W):
+    if not _replay_or_request_wrench(recorded, x, wrench_W):
         environment_wrench_about_Wo_into(arm, pairs, joints, applied_W, q, v, sheet, rest, wrench_W)
     else:
         added, none = np.empty(6), pairs[:0]
@@ -199,27 +199,27 @@ def contact_and_plant_rates_into(physics, x, tau, applied_W, wrench_W, xdot):
 
 
 @njit(cache=True)
-def _replay_or_request_wrench(given, x, wrench_W):
+def _replay_or_request_wrench(recorded, x, wrench_W):
     """Copy the next recorded wrench to `wrench_W`; return False if it is not recorded.
 
-    The caller appends a wrench and repeats its step until none is missing. Row 0 of `given`: number
-    of wrenches, number of calls, x of the first call without a wrench; other rows: wrenches (6,).
+    The caller appends a wrench and repeats its step until none is missing. Row 0 of `recorded`:
+    numbers of wrenches and calls, x of the first call without wrench; other rows: wrenches (6,).
     """
-    if given.shape[0] == 0:
+    if recorded.shape[0] == 0:
         return False
-    number = int(given[0, 1])
-    given[0, 1] += 1.0
-    if number < given[0, 0]:
-        copy_into(wrench_W, 0, given[1 + number], 0, 6)
+    number = int(recorded[0, 1])
+    recorded[0, 1] += 1.0
+    if number < recorded[0, 0]:
+        copy_into(wrench_W, 0, recorded[1 + number], 0, 6)
         return True
-    if number == given[0, 0]:
-        copy_into(given[0], 2, x, 0, x.shape[0])
+    if number == recorded[0, 0]:
+        copy_into(recorded[0], 2, x, 0, x.shape[0])
     return False
 
 
 @njit(cache=True)
 def plant_rates_under_wrench_into(physics, x, tau, applied_W, wrench_W, xdot):
-    """Write xdot of `contact_and_plant_rates_into` for the given contact wrench `wrench_W` (6,)."""
+    """Write xdot of `contact_and_plant_rates_into` for the contact wrench `wrench_W` (6,)."""
     arm, _, pairs, leaf, _, _ = physics
     half = tau.shape[0] + 1
     q, v = x[: half - 1], x[half : 2 * half - 1]

@@ -20,7 +20,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.station.environment import moving_bodies, point_contact
 from drake_teleop.station.environment.environment import Environment, ToolShapes
 
-_IDENTITY_POSE_TOLERANCE = 1e-12  # rounding of frames
+_IDENTITY_TOLERANCE_RAD_OR_M = 1e-12  # rounding of frames
 _MIN_MASS_MATRIX_EIGENVALUE_SI = 1e-12  # kg or kg m^2, smallest valid eigenvalue
 
 
@@ -114,7 +114,7 @@ def MakeToolContactModel(
     for index, own in shapes.items():
         frame = plant.get_body(index).body_frame()
         X_SBody = plant.CalcRelativeTransform(context, sensor_frame, frame)
-        is_identity = X_SBody.IsNearlyIdentity(_IDENTITY_POSE_TOLERANCE)
+        is_identity = X_SBody.IsNearlyIdentity(_IDENTITY_TOLERANCE_RAD_OR_M)
         from_S |= dict.fromkeys(own, RigidTransform() if is_identity else X_SBody)
     inspector, slip_speed = scene_graph.model_inspector(), environment.slip_speed
     touched = [*added.instances, tree.world_model_instance()]  # a link "world" may have shapes

@@ -232,8 +232,8 @@ class MjcfWriter:
         materials = [each for each in mjcf.elements_in("asset") if each.tag == "material"]
         self._colours = {e.get("name"): read(e, "", "material").get("rgba") for e in materials}
 
-    def write(self, world: Body, efforts: dict[str, float]) -> str:
-        """Return the MJCF text of a world body; joints in `efforts` get motors of these limits."""
+    def write(self, world: Body, effort_limits: dict[str, float]) -> str:
+        """Return the MJCF text of a world body; joints in `effort_limits` get motors."""
         self._write_joints_geoms_and_children(SubElement(self._root, "worldbody"), world)
         names = {body.name for body in world.with_descendants()}
         contact = SubElement(self._root, "contact")
@@ -242,7 +242,7 @@ class MjcfWriter:
             if each.tag == "exclude" and names.issuperset(ends.values()):
                 SubElement(contact, "exclude", ends)
         actuators = SubElement(self._root, "actuator")
-        for name, effort in efforts.items():
+        for name, effort in effort_limits.items():
             motor = SubElement(actuators, "motor", name=name, joint=name)
             if 0.0 < effort < float("inf"):
                 motor.set("ctrllimited", "true")

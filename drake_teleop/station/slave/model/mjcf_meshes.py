@@ -119,22 +119,22 @@ def fit_shape_to_mesh(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTran
 
 
 def _mass_properties_of_simplices(
-    corners: Array, weight: Array, centre: Array, num_vertices: int = 3
+    corners: Array, masses: Array, centre: Array, num_vertices: int = 3
 ) -> MassProperties:
     """Return mass properties of a shell (triangles), or solid of 4-vertex tetrahedra to `centre`.
 
-    `corners` (m, 3, 3) are relative to `centre`; `weight` (m,) are masses of the parts.
+    `corners` (m, 3, 3) are relative to `centre`; `masses` (m,) belong to the parts.
     """
     total = corners.sum(axis=1)
     second = np.einsum("nai,naj->nij", corners, corners) + np.einsum("ni,nj->nij", total, total)
-    products = np.einsum("n,nij->ij", weight, second) / (num_vertices * (num_vertices + 1))
+    products = np.einsum("n,nij->ij", masses, second) / (num_vertices * (num_vertices + 1))
     inertia = np.trace(products) * np.eye(3) - products
-    return MassProperties(float(weight.sum()), centre, inertia)
+    return MassProperties(float(masses.sum()), centre, inertia)
 
 
-def _tetrahedron_volumes(corners: Array, mode: str) -> Array:
+def _tetrahedron_volumes(corners: Array, inertia_rule: str) -> Array:
     volume = np.linalg.det(corners) / 6
-    return np.abs(volume) if mode == "legacy" else volume
+    return np.abs(volume) if inertia_rule == "legacy" else volume
 
 
 class Mesh:

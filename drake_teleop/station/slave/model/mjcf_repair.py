@@ -56,7 +56,7 @@ def repair_mjcf(model: model_repair.ModelRepair) -> None:
         world.geoms.clear()
         what = "left out, because the tool does not carry them: shapes of"
         model.add_assumption(what, "the world")
-    _check_names_and_generator_tags(bodies, model)
+    _report_equal_names_and_generators(bodies, model)
     _set_mass_properties(world, reader, set(moving), mjcf)
     with_motor = [joint for joint in moving if joint.kind in ("hinge", "slide")]
     efforts = {} if purpose.is_scene else _effort_limits(mjcf, with_motor)
@@ -251,7 +251,7 @@ def _symmetric_limit_from_range(mjcf: Mjcf, given: Attributes, name: str, flag: 
     return smaller if limits[0] < 0.0 < limits[1] else larger
 
 
-def _check_names_and_generator_tags(bodies: list[Body], model: model_repair.ModelRepair) -> None:
+def _report_equal_names_and_generators(bodies: list[Body], model: model_repair.ModelRepair) -> None:
     for body in bodies:
         for tag in body.generator_tags:
             model.add_fault(f"{body.name} contains the unsupported <{tag}>; save it from MuJoCo")
