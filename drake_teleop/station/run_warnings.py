@@ -145,7 +145,7 @@ def _check_reached_limits(result: SimulationResult, scenario: Scenario, arm: Arm
         advice = "use smaller motions, or increase kinematic_scaling.translation_scale"
         yield "the device is at the end of its workspace", find_spans(t, ended), advice
     if scenario.first_sheet_spring is not None and "sheet_state" in result:
-        bent = scenario.first_sheet_spring.max_linear_deflection
+        bent = scenario.first_sheet_spring.max_deflection_of_linear_model
         text = f"the deflection of the leaf exceeds {1e3 * bent:.0f} mm, the limit of its model,"
         spans = find_spans(t, np.abs(result["sheet_state"][:, 0]) > bent)
         yield text, spans, "reduce the contact force"

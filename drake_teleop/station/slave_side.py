@@ -236,7 +236,7 @@ def _add_slave_blocks(
     if scenario.load_estimator.watch:
         export_outputs(builder, estimator, "load_state")
 
-    if slave.can_touch:
+    if slave.can_tool_touch:
         _add_contact_and_moving_body_poses(builder, slave)
     return slave, sample, held
 

@@ -44,10 +44,10 @@ from drake_teleop.station.slave.plant_dynamics import (
     PROXIMITY_NEAR_MONITORED,
     PROXIMITY_TOUCHING,
     ContactPlantCopy,
+    classify_tool_proximity,
     contact_and_plant_rates_into,
     contact_wrench_W,
     environment_wrench_about_Wo_into,
-    tool_proximity,
 )
 from drake_teleop.station.slave.posture_shapes import start_overlap_texts
 from drake_teleop.station.slave.scene import Scene
@@ -378,7 +378,9 @@ def test_separation_of_tool_and_unmodelled_shapes():
         for row in rows:
             row[:, 15] += height
         nothing = np.zeros(2)
-        found.append(tool_proximity(built.arm.table, *rows, joints, built.start, nothing, nothing))
+        found.append(
+            classify_tool_proximity(built.arm.table, *rows, joints, built.start, nothing, nothing)
+        )
     assert found == [
         PROXIMITY_FAR,
         PROXIMITY_TOUCHING,

@@ -33,7 +33,7 @@ from drake_teleop.station.slave.joint_commands import JointRangeMonitor, pick_ik
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.numeric_inverse_kinematics import NumericInverseKinematics
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave, ParseSlave, start_pose
-from drake_teleop.station.slave.slave_config import Ball, Block, Slave, Tool, tip_of_tool_shapes
+from drake_teleop.station.slave.slave_config import Ball, Block, Slave, Tool, p_STip_of_shapes
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 HOME = [0.3, 0.4, -0.2, 0.1, 0.5, -0.3, 0.2]
@@ -462,7 +462,7 @@ def test_tip_of_a_rotated_box_is_at_the_height_of_its_farthest_corner(rpy):
     corners = [box.pose @ (0.5 * np.array(x) * box.edges) for x in product((-1, 1), repeat=3)]
     tool = Tool(mass=1.0, shapes=[Ball(position=[0.0, 0.0, 0.1]), box])
     expected = [*box.position[:2], max(corner[2] for corner in corners)]
-    np.testing.assert_allclose(tip_of_tool_shapes(tool), expected, atol=1e-12)
+    np.testing.assert_allclose(p_STip_of_shapes(tool), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(("beyond", "stops"), [(0.005, False), (0.02, True), (np.nan, True)])

@@ -347,9 +347,9 @@ TABLE = '<model name="table"><link name="top"/><joint name="x" type="gearbox"/><
     [
         (
             f"<world name='w'>{TABLE}<light/>{ARM_SDF}</world>",
-            "models beside the arm left out: table",
+            "models beside the arm are left out: table",
         ),
-        (f"{ARM_SDF}{TABLE}", "models beside the arm left out: table"),
+        (f"{ARM_SDF}{TABLE}", "models beside the arm are left out: table"),
         (ARM_SDF, "held: f"),
     ],
 )

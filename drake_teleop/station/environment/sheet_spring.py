@@ -55,7 +55,7 @@ class SheetSpring(environment.Environment):
         return 2 * self.damping_ratio * np.sqrt(self.stiffness * self.effective_mass)
 
     @property
-    def max_linear_deflection(self) -> float:
+    def max_deflection_of_linear_model(self) -> float:
         """Largest deflection for which the linear model is valid, 10 % of the length [m]."""
         return 0.1 * self.length
 

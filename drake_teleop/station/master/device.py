@@ -49,7 +49,7 @@ def check_device_period(device: HapticDevice | LeaderDevice, q: Array, period: f
         what = f"the friction stops the haptic device within {1e3 / rate:.2g} ms, so that its"
         what = f"{what} simulation with a period of {1e3 * period:g} ms is unstable"
         remedy = "choose less friction, or a higher rates.hand_hz"
-        raise DrakeTeleopError(what, where=device.friction_setting_path, remedy=remedy)
+        raise DrakeTeleopError(what, where=device.friction_setting_name, remedy=remedy)
 
 
 class MasterDevice(LeafSystem):

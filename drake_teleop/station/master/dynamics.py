@@ -100,7 +100,7 @@ class HapticDevice:
         return self.packed_parameters[0]
 
     @property
-    def friction_setting_path(self) -> str:
+    def friction_setting_name(self) -> str:
         return "master.friction" if self.is_phantom else "master.figures"
 
     def coordinates_for_force_display(self, q: Array) -> Array:

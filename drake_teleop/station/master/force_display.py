@@ -13,7 +13,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.master import dynamics
 from drake_teleop.station.master.device_parameters import DeviceParameters
-from drake_teleop.station.master.leader import LeaderDevice, limit_wrench_to_motor_torques
+from drake_teleop.station.master.leader import LeaderDevice, scale_wrench_to_motor_limits
 from drake_teleop.station.passivity import safe_state
 from drake_teleop.station.passivity.memory import SlotAllocator
 from drake_teleop.station.passivity.packet import limit_group
@@ -177,7 +177,7 @@ class ForceDisplay(LeafSystem):
             if np.isfinite(wrench).all() and np.isfinite(q).all():
                 limits = self._parameters[0], self._jacobian, self._limited
                 limit_wrench_into(wrench, *limits)  # first: undisplayed torque needs no motor
-                limit_wrench_to_motor_torques(self._leader, q, self._limited, self._limited)
+                scale_wrench_to_motor_limits(self._leader, q, self._limited, self._limited)
                 wrench = self._limited
         constants = self._parameters, self._period, self._jacobian
         step_display(wrench, self._device.Eval(context), *constants, output.get_mutable_value())

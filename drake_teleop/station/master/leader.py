@@ -132,7 +132,7 @@ def step_leader(leader, weight, state, pose, twist, display, hand_wrench, drive,
 
 
 @njit(cache=True)
-def limit_wrench_to_motor_torques(leader, q, wrench, limited):
+def scale_wrench_to_motor_limits(leader, q, wrench, limited):
     """Write `wrench` (6,) to `limited`, scaled so that motors with weight keep their limits."""
     _, arm, joint_table = leader
     n = q.shape[0]
@@ -183,7 +183,7 @@ class LeaderDevice:
     name: str = "leader"
     is_phantom = False
     #: Scenario field of the friction.
-    friction_setting_path = "master.leader"
+    friction_setting_name = "master.leader"
 
     @property
     def parameters(self) -> DeviceParameters:

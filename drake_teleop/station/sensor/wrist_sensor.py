@@ -51,11 +51,11 @@ from drake_teleop.station.slave.plant_dynamics import (
     PROXIMITY_TOUCHING,
     ContactPlantCopy,
     assemble_plant_state_into,
+    classify_tool_proximity,
     contact_and_plant_rates_into,
     contact_wrench_W,
     environment_wrench_about_Wo_into,
     plant_rates_under_wrench_into,
-    tool_proximity,
 )
 from drake_teleop.station.wiring import connect_matching_inputs
 
@@ -284,7 +284,7 @@ class WristSensor(LeafSystem):
         # The plant's contact wrench costs as much as two samples; noise exceeds its gain by 1e9.
         self._uses_plant_contact = config.ideal or bool(contact.drake_contact_reason)
         # Contact needs many steps per torque sample, so queueing them saves time.
-        queues = slave.can_touch and not contact.drake_contact_reason
+        queues = slave.can_tool_touch and not contact.drake_contact_reason
         self._max_queued_steps = _MAX_QUEUED_PLANT_STEPS if queues else 1
         self._around = np.zeros(2 + contact.plant_state_size)
         tail = np.zeros(2 + self._max_queued_steps * (2 * n + 1 + len(self._around)))
@@ -314,7 +314,7 @@ class WristSensor(LeafSystem):
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
         if contact.plant_state_size:
             self._plant = self.DeclareVectorInputPort("plant_state", contact.plant_state_size)
-        if slave.can_touch:
+        if slave.can_tool_touch:
             contacts = Value[ContactResults]()
             self._contacts = self.DeclareAbstractInputPort("contact_results", contacts)
             self._tool = contact.tool_bodies, contact.tool_shapes
@@ -376,7 +376,7 @@ class WristSensor(LeafSystem):
             return PROXIMITY_TOUCHING
         arm, _, pairs, _, joints, _ = self._physics
         q, sheet, plant = state[: self._n], surroundings[:2], surroundings[2:]
-        return tool_proximity(arm, pairs, self._monitored_pairs, joints, q, sheet, plant)
+        return classify_tool_proximity(arm, pairs, self._monitored_pairs, joints, q, sheet, plant)
 
     def _plant_contact_wrench_W(self, context: Context) -> Array:
         assert self._contacts is not None

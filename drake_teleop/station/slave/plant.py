@@ -24,7 +24,7 @@ from drake_teleop.station.slave import arm_from_plant, home
 from drake_teleop.station.slave.arm import DRY_FRICTION_COLUMN, ArmModel, JointFriction
 from drake_teleop.station.slave.chain_joints import bodies_carried_by, set_torque_limits
 from drake_teleop.station.slave.models import ParseModel, translate_drake_errors
-from drake_teleop.station.slave.slave_config import AddPayload, AddTool, Slave, tip_of_tool_shapes
+from drake_teleop.station.slave.slave_config import AddPayload, AddTool, Slave, p_STip_of_shapes
 from drake_teleop.station.slave.surroundings import (
     AddEnvironment,
     MakeToolContactModel,
@@ -96,7 +96,7 @@ class SlavePlant:
         return arm_from_plant.values_per_joint(self.arm, friction, "slave.friction", 0.0)
 
     @property
-    def can_touch(self) -> bool:
+    def can_tool_touch(self) -> bool:
         return len(self.contact.compiled_pairs) > 0 or bool(self.contact.drake_contact_reason)
 
     @property
@@ -323,7 +323,7 @@ def _tip_in_S(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: Arm
             return tip.GetFixedPoseInBodyFrame().translation()
         return tip.CalcPose(plant.CreateDefaultContext(), parsed.sensor_frame).translation()
     if slave.tool is not None and slave.tool.mass > 0.0:
-        end = tip_of_tool_shapes(slave.tool)
+        end = p_STip_of_shapes(slave.tool)
         return arm.phi_load[1:4] / arm.phi_load[0] if end is None else np.array(end)
     hulls = _hull_points_beyond_sensor_S(slave)
     if not hulls:

@@ -110,7 +110,7 @@ def _move_box_with_body(pair, bodies, placed):
 
 
 @njit(cache=True)
-def tool_proximity(arm, pairs, monitored_pairs, joints, q, sheet, state):
+def classify_tool_proximity(arm, pairs, monitored_pairs, joints, q, sheet, state):
     """Return PROXIMITY_NEAR_MONITORED if a pair of `monitored_pairs` may be closer than 2 cm.
 
     Otherwise return PROXIMITY_TOUCHING if one of `pairs` touches, else PROXIMITY_FAR.

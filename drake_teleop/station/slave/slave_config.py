@@ -186,7 +186,7 @@ def AddPayload(plant: MultibodyPlant, holder: Frame, payload: Payload) -> None:
     plant.AddJoint(weld)
 
 
-def tip_of_tool_shapes(tool: Tool) -> list[float] | None:
+def p_STip_of_shapes(tool: Tool) -> list[float] | None:
     """Return p_STip [m], the farthest shape's end along z_S; None without shapes."""
     halves = [x.radius if isinstance(x, Ball) else x.half_extent_along_z for x in tool.shapes]
     ends = [np.add(x.position, [0.0, 0.0, h]) for x, h in zip(tool.shapes, halves, strict=True)]

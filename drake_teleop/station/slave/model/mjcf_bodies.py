@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.model import mjcf_meshes, model_numbers
 from drake_teleop.station.slave.model.mjcf_elements import (
-    MIN_DIRECTION_VECTOR_LENGTH,
+    MIN_DIRECTION_LENGTH,
     Attributes,
     Mjcf,
     smallest_rotation_of_z_to,
@@ -131,7 +131,7 @@ class BodyReader:
         given.label = f"joint {name}"
         kind = "free" if tag == "freejoint" else given.get("type", "hinge")
         axis = given.vector("axis", (0.0, 0.0, 1.0))
-        if np.linalg.norm(axis) < MIN_DIRECTION_VECTOR_LENGTH:
+        if np.linalg.norm(axis) < MIN_DIRECTION_LENGTH:
             self._mjcf.model.add_fault(f"joint {name}: axis has length 0; set a direction")
             axis = np.array([0.0, 0.0, 1.0])
         limits = given.read_range("range", "limited", autolimits=self._mjcf.autolimits)
@@ -151,7 +151,7 @@ class BodyReader:
             X_FG = RigidTransform(smallest_rotation_of_z_to(ends[0] - ends[1]), ends.mean(axis=0))
             half = float(np.linalg.norm(ends[0] - ends[1])) / 2
             size = [size[0], half, 0.0] if kind in _ROUND_ROD_SHAPES else [size[0], size[0], half]
-        found = self.meshes.find(name) if name else None
+        found = self.meshes.find_mesh_or_fault(name) if name else None
         mesh, fault = (None, found) if isinstance(found, str) else (found, "")
         if kind in ("hfield", "sdf") or (kind == "mesh" and not name):
             fault = f"shapes of type {kind} are not supported"

@@ -18,7 +18,7 @@ from drake_teleop.station.slave.model.model_references import read_xml
 from drake_teleop.station.slave.model.model_repair import ModelRepair
 
 _MAX_ELEMENT_NESTING_DEPTH = 150  # largest depth of nested elements
-MIN_DIRECTION_VECTOR_LENGTH = 1e-9
+MIN_DIRECTION_LENGTH = 1e-9
 """Shortest vector that has a direction."""
 _ORIENTATION_ATTRIBUTES = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 # A shorter list is completed by the last numbers of the default.
@@ -151,7 +151,7 @@ class Mjcf:
         if "xyaxes" in given:
             axes = given.vector("xyaxes", (1.0, 0.0, 0.0, 0.0, 1.0, 0.0))
             z = np.cross(axes[:3], axes[3:])
-            if np.linalg.norm(z) < MIN_DIRECTION_VECTOR_LENGTH:
+            if np.linalg.norm(z) < MIN_DIRECTION_LENGTH:
                 self.model.add_fault(f"{given.label}: its xyaxes are parallel")
                 return RotationMatrix()
             columns = np.column_stack([axes[:3], np.cross(z, axes[:3]), z])

@@ -194,7 +194,7 @@ class MeshLibrary:
                 mesh = Mesh(mjcf, attributes, file)
                 self._meshes[mesh.name] = fault or mesh
 
-    def find(self, name: str) -> Mesh | str:
+    def find_mesh_or_fault(self, name: str) -> Mesh | str:
         """Return the mesh with this name, or a text about its fault."""
         mesh = self._meshes.get(name, model_references.MESHES_NOT_FOUND_FAULT)
         if isinstance(mesh, Mesh) and not mesh.is_readable_by_drake:

@@ -153,7 +153,7 @@ def _make_joint_and_link_names_unique(scope: Element, model: ModelRepair, *, is_
             model.add_fault(f"two links are named {name}; rename one of them")
         elif name in links:
             scope.remove(link)
-            model.add_repair("a second link of the same name left out:", name)
+            model.add_repair("a second link with the same name is left out:", name)
         links.add(name)
 
 
@@ -255,7 +255,7 @@ def _remove_models_without_sensor_frame(model: ModelRepair) -> None:
     for other in named:
         if other is not kept:
             name = other.get("name") or other.findtext("name") or other.findtext("uri") or ""
-            model.add_repair("models beside the arm left out:", name)
+            model.add_repair("models beside the arm are left out:", name)
 
 
 def _has_sensor_frame(element: Element, model: ModelRepair) -> bool:
