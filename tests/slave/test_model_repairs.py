@@ -283,7 +283,7 @@ def test_joint_of_the_chain_does_not_mimic_a_joint_beside_it(tmp_path):
     text = arm(j3=joint(3, inside='<mimic joint="j9" multiplier="-1"/>'), beyond=beside)
     _, model, said = read(written(tmp_path, text))
     assert model.joint_names == tuple(f"j{i}" for i in range(1, 7))
-    assert said.startswith("independent of the joint that it mimics, which does not move S: j3; ")
+    assert said.startswith("joint moves alone, as the joint that it mimics does not move S: j3; ")
     path = written(tmp_path, text)
     with pytest.raises(DrakeTeleopError, match=r"j3 moves with another joint"):
         read(path, hold={"j9": 0.3})  # which would not hold j3

@@ -262,8 +262,8 @@ def point_contact_force_into(
 ) -> None:
     """Write the contact force on a sphere in a box into `force` (3,) [N], in W.
 
-    `pair` is a row of `ShapePairs.compiled_pairs`, `depth` [m] the penetration, `normal` points out
-    of the box, `velocity` [m/s] is that of the sphere at the contact, relative to the box.
+    `pair` is a row of `ShapePairs.compiled_pairs`, `depth` [m] the penetration; `normal` points out
+    of the box. `velocity` [m/s] is that of the sphere at the contact, relative to the box.
     """
     out = dot(velocity, normal)
     f_n = max(pair[22] * depth * (1.0 - pair[23] * out), 0.0)

@@ -1,7 +1,7 @@
 """Repair of an MJCF text, so that Drake reads the arm in it as MuJoCo does.
 
 The new text has poses as quaternions, angles in rad, masses as explicit inertias, one joint per
-body, and only the bodies that the arm carries.
+body, and only bodies that the arm carries.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def repair_mjcf(model: model_repair.ModelRepair) -> None:
         _check_joint_couplings(world, chain, moving, mjcf)
     if purpose.is_tool and world.geoms:
         world.geoms.clear()
-        what = "left out, because the tool does not carry them: shapes of"
+        what = "shapes are left out, because the tool does not carry them, of"
         model.add_assumption(what, "the world")
     _report_equal_names_and_generators(bodies, model)
     _set_mass_properties(world, reader, set(moving), mjcf)

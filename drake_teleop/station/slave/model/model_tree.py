@@ -56,7 +56,7 @@ def reduce_to_chain(
             for mimic in element.findall("mimic"):
                 if joint.get("type") != "fixed" and mimic.get("joint") not in names:
                     element.remove(mimic)
-                    what = "independent of the joint that it mimics, which does not move S:"
+                    what = "joint moves alone, as the joint that it mimics does not move S:"
                     model.add_assumption(what, joint.get("name", ""))
     for joint in list_joints(scope):
         if joint not in chain and joint.get("name") not in model.purpose.held_positions:
