@@ -20,7 +20,7 @@ from drake_teleop.station.slave.plant import (
     ParseSlave,
     finalize_without_limit_warnings,
 )
-from drake_teleop.station.slave.posture_shapes import joint_sampling_range
+from drake_teleop.station.slave.posture_shapes import random_posture_limits
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
 #: Overlaps below this depth are rounding of hulls [m].
@@ -88,7 +88,7 @@ def _overlaps(
     at_start, positions = depths(), plant.GetPositions(context)
     random, counts = np.random.default_rng(5), Counter[frozenset[BodyIndex]]()
     motions = {pair: list[np.ndarray]() for pair in at_start}
-    for q in random.uniform(*joint_sampling_range(arm), (_NUM_POSTURES, arm.num_joints)):
+    for q in random.uniform(*random_posture_limits(arm), (_NUM_POSTURES, arm.num_joints)):
         posture = positions.copy()
         posture[arm.position_index] = q
         plant.SetPositions(context, posture)

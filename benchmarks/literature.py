@@ -59,7 +59,7 @@ from drake_teleop.station.task_measures import task_measures
 
 Array = NDArray[np.float64]
 
-_PUSH_S, _STEP_S = 0.3, 1e-4  # s, duration of a push (E); s
+_PUSH_S, _STEP_S = 0.3, 1e-4  # s, duration of a push (estimate); s
 _GAIN = 50.0  # 1/s, gain of the momentum observer
 _ROUND_TRIPS, _LOSSES = (0.008, 0.064, 0.256, 0.576, 1.088), (0.0, 0.25, 0.5)  # s; 1
 

@@ -38,7 +38,7 @@ the code (`python docs/make_reference.py`).
 
 Frames: W is the world, z up; B the base of the master, E its stylus; S the wrist sensor, A its
 accelerometers. `p_WS` is the position of S's origin in W, `R_SA` the rotation of A in S. Equations
-and sections are those of the paper; (E) marks an estimate of this project, not of the paper.
+and sections are those of the paper; "estimate" marks a value of this project, not of the paper.
 """
 
 

@@ -91,7 +91,7 @@ def test_station_is_at_rest_before_the_intent_starts(name):
 def test_contact_is_one_touch_with_small_deflection(movement):
     scenario, result = movement
     bend = np.abs(result["sheet_state"][:, 0]).max()
-    assert 0.002 < bend < 0.5 * scenario.sheet_spring.max_linear_deflection
+    assert 0.002 < bend < 0.5 * scenario.sheet_spring.max_deflection_of_linear_model
     touching = np.any(result["true_contact_wrench_W"] != 0, axis=1)
     assert 0.205 < result.t[touching].min() < 0.235
     assert result.t[touching].max() < 0.3

@@ -344,10 +344,13 @@ def test_a_torque_that_is_no_number_keeps_the_arm_where_it_is():
     ("controller", "says"),
     [
         ("impedance", "controller: expected System, found 'impedance'; make a Drake system"),
-        (Silent({"wrench_B": 6}, {}), "controller: the block has no input port 'pose_command'"),
+        (
+            Silent({"wrench_B": 6}, {}),
+            "controller: the custom controller has no input port 'pose_command'",
+        ),
         (
             Silent({"pose_command": 7}, {}),
-            "controller: the block has no output port 'joint_torque'",
+            "controller: the custom controller has no output port 'joint_torque'",
         ),
         (Follower("joint_torque", 5), "its output port 'joint_torque' has 5 numbers"),
     ],

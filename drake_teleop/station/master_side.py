@@ -33,7 +33,7 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
         - clutch: (1,) engaged if above 0.5; engaged if unconnected
         - intended_pose: (7,) X_BE that replaces the scenario's intent; may stay unconnected
         - intended_twist: (6,) twist [v; omega] of intended_pose, in B; zero if unconnected
-        - slave_state: [q; v] of the slave, for the operator's view of the tool (with a task)
+        - slave_state: [q; v] of the slave, for the operator of a task
         output_ports:
         - pose_command: (7,) X_WS, setpoint of the slave
         - leader_joints: (n,) setpoint of the slave's joints (leader arm in joint mode) [rad]
@@ -47,14 +47,14 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
     """
     check_scenario(scenario)
     hand, scaling = scenario.operator.hand, scenario.kinematic_scaling
-    start_B = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
-    start_W = start_pose(scenario.slave)
+    X_BE_start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
+    X_WS_start = start_pose(scenario.slave)
     builder = DiagramBuilder()
 
     name = "operator" if operator is None else "live_hand"
-    operator = builder.AddNamedSystem(name, operator or _make_operator(scenario, start_B))
+    operator = builder.AddNamedSystem(name, operator or _make_operator(scenario, X_BE_start))
     period, model = 1 / scenario.rates.hand_hz, scenario.master.device(hand.mass, hand.inertia)
-    q_start = model.inverse_kinematics(start_B)
+    q_start = model.inverse_kinematics(X_BE_start)
     device, display = AddDeviceAndForceDisplay(builder, period, model, q_start)
     builder.Connect(operator.GetOutputPort("hand_wrench_E"), device.GetInputPort("hand_wrench_E"))
     builder.Connect(device.GetOutputPort("pose_master"), operator.GetInputPort("pose_master"))
@@ -73,7 +73,7 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
         slave = NominalSlave(scenario.slave)
         coupling = JointCoupling(slave.arm, slave.start, model.home, CLUTCH_PERIOD_S)
     else:
-        coupling = KinematicScaling(scaling, CLUTCH_PERIOD_S, start_W)
+        coupling = KinematicScaling(scaling, CLUTCH_PERIOD_S, X_WS_start)
     kinematic_scaling = builder.AddNamedSystem("kinematic_scaling", coupling)
     read, command = device.GetOutputPort("pose_master"), display.GetInputPort("wrench_command")
     if scenario.master.encoder_steps().any() and isinstance(model, HapticDevice):
@@ -83,7 +83,7 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
         read = encoders.get_output_port()
     own_period = scenario.master.sampling_period_if_slower_than_hand(scenario.rates.hand_hz)
     if own_period is not None:
-        held_pose = builder.AddNamedSystem("held_pose", SampleHold(own_period, start_B))
+        held_pose = builder.AddNamedSystem("held_pose", SampleHold(own_period, X_BE_start))
         held_wrench = builder.AddNamedSystem("held_wrench", SampleHold(own_period, np.zeros(6)))
         builder.Connect(read, held_pose.get_input_port())
         builder.Connect(held_wrench.get_output_port(), command)
@@ -102,13 +102,13 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
     return builder.Build()
 
 
-def _make_operator(scenario: Scenario, start_B: Array) -> Operator:
+def _make_operator(scenario: Scenario, X_BE_start: Array) -> Operator:
     if scenario.operator.task is None:
-        return Operator(scenario.operator, start_B)
+        return Operator(scenario.operator, X_BE_start)
     scaling, forces = scenario.kinematic_scaling, scenario.force_scaling
     forward, backward = (mean_delay(line) for line in scenario.channel.networks_of_directions())
     gains = scaling.translation_scale, forces.scales().gamma * forces.force_scale
     training = OperatorTraining(scaling.R_WB, *gains, forward, backward, scenario.simulation.seed)
     slave = NominalSlave(scenario.slave)
     tip = np.concatenate([slave.tip, slave.p_WTip_start])
-    return Operator(scenario.operator, start_B, training, slave.arm, tip)
+    return Operator(scenario.operator, X_BE_start, training, slave.arm, tip)

@@ -136,16 +136,16 @@ def _check_reached_limits(result: SimulationResult, scenario: Scenario, arm: Arm
             reached = np.abs(shown[:, 3:]) >= _REACHED_LIMIT_SHARE * limits.peak_torque
             full |= reached.any(axis=1) & limits.peak_torque.all()
             joints = result["master_state"][:, : device.num_joints]
-            full |= device.is_any_motor_at_limit(joints, shown, _REACHED_MOTOR_LIMIT_SHARE)
+            full |= device.flag_samples_at_motor_limit(joints, shown, _REACHED_MOTOR_LIMIT_SHARE)
         elif limits.peak_torque.all():
             full |= _is_torque_at_limit(shown[:, 3:], result["master_state"], device)
         spans = find_spans(t, full, _MIN_WARNING_SPAN_S)
         yield "the device displays its largest force or torque", spans, _REDUCE_FORCE_ADVICE
-        ended = device.is_any_axis_at_end_stop(result["master_state"][:, : device.num_joints])
+        ended = device.flag_samples_at_end_stop(result["master_state"][:, : device.num_joints])
         advice = "use smaller motions, or increase kinematic_scaling.translation_scale"
         yield "the device is at the end of its workspace", find_spans(t, ended), advice
     if scenario.first_sheet_spring is not None and "sheet_state" in result:
-        bent = scenario.first_sheet_spring.max_linear_deflection
+        bent = scenario.first_sheet_spring.max_deflection_of_linear_model
         text = f"the deflection of the leaf exceeds {1e3 * bent:.0f} mm, the limit of its model,"
         spans = find_spans(t, np.abs(result["sheet_state"][:, 0]) > bent)
         yield text, spans, "reduce the contact force"

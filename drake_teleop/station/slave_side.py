@@ -17,7 +17,7 @@ from drake_teleop.station.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.station.sensor.wrist_sensor import AddCompiledWristSensor
 from drake_teleop.station.signals import MOVING_BODY_POSE_PREFIX
 from drake_teleop.station.slave import joint_commands
-from drake_teleop.station.slave.arm import ARM_FRICTION_TANH_SPEED_RAD_OR_M_S, ForwardKinematics
+from drake_teleop.station.slave.arm import ARM_FRICTION_TANH_SPEED_SI, ForwardKinematics
 from drake_teleop.station.slave.joint_control import HeldTorque, JointControl, mass_matrix
 from drake_teleop.station.slave.plant import AddSlavePlant, SlavePlant
 from drake_teleop.station.slave.plant_dynamics import DrakeContact, ToolContact
@@ -26,9 +26,9 @@ from drake_teleop.station.slave.surroundings import MovingBodyPose
 from drake_teleop.station.wiring import connect_matching_inputs, connect_ports, export_outputs
 
 #: Sampling period of the monitor [s]; 2 kHz events would cost time.
-SLAVE_MONITOR_PERIOD_S = 0.01
+RANGE_MONITOR_PERIOD_S = 0.01
 # Stability limit of explicit steps for a decay, such as of speed by friction: rate times step.
-_MAX_FRICTION_RATE_TIMES_STEP = 2.0
+_MAX_DECAY_RATE_TIMES_STEP = 2.0
 
 
 def MakeSlaveSide(
@@ -52,7 +52,7 @@ def MakeSlaveSide(
         - pose_slave: (7,) actual X_WS of the present joint angles (over a network)
         - saturated: (1,) above 0.5 while the wrench is invalid; also a signal
         - contact: (1,) 1 in contact; also a signal (with contact detection)
-        - the parts of a sample (`signal_sizes_of_sample`), slave_state, joint_torque,
+        - the sensor's signals such as measured_wrench_S, slave_state, joint_torque,
           joint_command, ik_status, scaled_wrench_S, fault: signals
         - load_estimate, contact_wrench_S (if the load is identified or estimated online): signals
         - load_state (if the load is monitored), true_contact_wrench_W (with surroundings),
@@ -61,12 +61,13 @@ def MakeSlaveSide(
         - sample, scaled_contact_and_fault: several of these signals in one port, for the log
 
     Args:
-        load_estimate, load_covariance, noise_floor: as for `MakeTeleopStation`.
+        load_estimate: (16,) Eq. (7), [offsets; phi], and `load_covariance` (16, 16) of it.
+        noise_floor: of `identify_load`, for contact detection.
         controller: custom control law of the arm (docs/station.md, "A controller of your own").
             Its output `joint_torque` (n) [N m] replaces inverse kinematics and joint control, or
-            its output `pose_command` (7) is the setpoint of both. Its input `pose_command` (7) is
-            that of this side; `slave_state` (2 n), `pose_slave` (7), `contact_wrench_S` (6) and the
-            parts of a sample are connected if it has such inputs.
+            its output `pose_command` (7) is their setpoint. It requires the input `pose_command`
+            (7); inputs `slave_state` (2 n), `pose_slave` (7), `contact_wrench_S` (6) and of the
+            sensor's signals are optional.
 
     Raises:
         DrakeTeleopError: for an unreachable start, or if load estimate or noise floor is required.
@@ -74,7 +75,7 @@ def MakeSlaveSide(
     check_scenario(scenario)
     torques = _is_torque_controller(controller, scenario)
     uses_contact = controller is not None and controller.HasInputPort("contact_wrench_S")
-    _check_load_is_known(scenario, load_estimate, uses_contact)
+    _check_load_estimate(scenario, load_estimate, uses_contact)
     if load_covariance is not None:
         finite_array("load_covariance", load_covariance, 16, 16)
         expect_type((list, tuple, np.ndarray), load_estimate, "load_estimate", "pass both")
@@ -90,7 +91,7 @@ def MakeSlaveSide(
         connect_ports(builder, controller, "joint_torque", joint_control, "requested_torque")
     else:
         follows_leader = scenario.master.is_joint_leader
-        name = joint_commands.used_ik_method(scenario.slave.inverse_kinematics, arm)
+        name = joint_commands.pick_ik_method(scenario.slave.inverse_kinematics, arm)
         make_ik = joint_commands.IK_METHODS[name]
         if follows_leader:
             make_ik = joint_commands.LeaderJointFollower
@@ -133,7 +134,8 @@ def MakeSlaveSide(
     if scenario.contact_detection is not None:
         if noise_floor is None:
             remedy = "pass noise_floor=identify_load(...).noise_floor"
-            raise DrakeTeleopError("no noise floor given", where="contact_detection", remedy=remedy)
+            what = "contact detection requires a noise floor"
+            raise DrakeTeleopError(what, where="contact_detection", remedy=remedy)
         expect_type(NoiseFloor, noise_floor, "noise_floor", "pass that of identify_load")
         period = 1 / scenario.rates.estimator_hz
         detection = ContactDetection(scenario.contact_detection, noise_floor, arm, period)
@@ -148,14 +150,14 @@ def _is_torque_controller(controller: System | None, scenario: Scenario) -> bool
         return False
     expect_type(System, controller, "controller", "make a Drake system: docs/station.md")
     torques: bool = controller.HasOutputPort("joint_torque")
-    missing = ""
+    what = ""
     if not controller.HasInputPort("pose_command"):
-        missing = "input port 'pose_command'"
+        what = "the custom controller has no input port 'pose_command'"
     elif not (torques or controller.HasOutputPort("pose_command")):
-        missing = "output port 'joint_torque' or 'pose_command'"
-    if missing:
+        what = "the custom controller has no output port 'joint_torque' or 'pose_command'"
+    if what:
         remedy = "docs/station.md lists its ports"
-        raise DrakeTeleopError(f"the block has no {missing}", where="controller", remedy=remedy)
+        raise DrakeTeleopError(what, where="controller", remedy=remedy)
     scenario.master.check_pose_mode("a custom controller")
     return torques
 
@@ -163,8 +165,8 @@ def _is_torque_controller(controller: System | None, scenario: Scenario) -> bool
 def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
     """Build the slave side without master: its joints follow an excitation trajectory.
 
-    `trajectory` runs once after the settling time. Output ports are those of `MakeSlaveSide`
-    that need neither a pose command nor force scaling.
+    `trajectory` runs once after the settling time. Output ports are those of `MakeSlaveSide` that
+    need neither a pose command nor force scaling.
     """
     builder = DiagramBuilder()
     start, _, _ = trajectory.evaluate(0.0)
@@ -186,7 +188,7 @@ def _add_slave_blocks(
     *,
     custom_torque: bool = False,
 ) -> tuple[SlavePlant, dict[str, OutputPort], float]:
-    """Add plant, servo, sensor, load estimator; return plant, sample ports, torque period [s]."""
+    """Add the blocks; return plant, sensor ports by signal, and hold time of the torque [s]."""
     rates, sensor = scenario.rates, scenario.wrist_sensor
     slave = AddSlavePlant(builder, scenario.slave, scenario.surroundings, q_start)
     arm, plant, start, ports = slave.arm, slave.plant, slave.start, slave.ports
@@ -210,7 +212,7 @@ def _add_slave_blocks(
     builder.Connect(torque["joint_torque"], plant.get_actuation_input_port(slave.instance))
     export_outputs(builder, control, "joint_torque")
 
-    range_monitor = joint_commands.JointRangeMonitor(arm, SLAVE_MONITOR_PERIOD_S)
+    range_monitor = joint_commands.JointRangeMonitor(arm, RANGE_MONITOR_PERIOD_S)
     monitor = builder.AddNamedSystem("monitor", range_monitor)
     connect_matching_inputs(builder, monitor, ports)
 
@@ -234,7 +236,7 @@ def _add_slave_blocks(
     if scenario.load_estimator.watch:
         export_outputs(builder, estimator, "load_state")
 
-    if slave.can_touch:
+    if slave.can_tool_touch:
         _add_contact_and_moving_body_poses(builder, slave)
     return slave, sample, held
 
@@ -250,10 +252,10 @@ def _check_friction_time_step(slave: SlavePlant, step: float) -> None:
     if not slave.joint_friction.any():
         return
     mass = mass_matrix(slave.arm, slave.start)
-    slope = np.diag(slave.joint_friction / ARM_FRICTION_TANH_SPEED_RAD_OR_M_S)
+    slope = np.diag(slave.joint_friction / ARM_FRICTION_TANH_SPEED_SI)
     rate = float(np.linalg.eigvals(np.linalg.solve(mass, slope)).real.max())
-    if rate * step > _MAX_FRICTION_RATE_TIMES_STEP:
-        shorter = 0.9 * _MAX_FRICTION_RATE_TIMES_STEP / rate
+    if rate * step > _MAX_DECAY_RATE_TIMES_STEP:
+        shorter = 0.9 * _MAX_DECAY_RATE_TIMES_STEP / rate
         steps = f"too fast for steps of {1e3 * step:g} ms"
         what = f"the friction stops a joint within {1e3 / rate:.2g} ms, {steps}"
         remedy = f"reduce the friction, or set simulation.max_step: {shorter:.2g}"
@@ -276,7 +278,7 @@ def _add_contact_and_moving_body_poses(builder: DiagramBuilder, slave: SlavePlan
         export_outputs(builder, pose, **{MOVING_BODY_POSE_PREFIX + name: "pose"})
 
 
-def _check_load_is_known(scenario: Scenario, estimate: Array | None, uses_contact: bool) -> None:
+def _check_load_estimate(scenario: Scenario, estimate: Array | None, uses_contact: bool) -> None:
     if hasattr(estimate, "estimate"):
         what = f"expected 16 numbers, found {type(estimate).__name__}"
         remedy = "pass the attribute .estimate of this object"

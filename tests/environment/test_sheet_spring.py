@@ -29,7 +29,7 @@ def test_the_default_leaf_is_that_of_the_hardware_notes():
     sheet = SheetSpring()
     assert sheet.stiffness == pytest.approx(5129.0, rel=1e-3)
     assert sheet.effective_mass == pytest.approx(0.0377, rel=2e-3)
-    assert sheet.max_linear_deflection == pytest.approx(0.017)
+    assert sheet.max_deflection_of_linear_model == pytest.approx(0.017)
 
 
 def test_leaf_has_the_frequency_of_its_stiffness_and_mass_and_decays():

@@ -44,10 +44,10 @@ from drake_teleop.station.slave.plant_dynamics import (
     PROXIMITY_NEAR_MONITORED,
     PROXIMITY_TOUCHING,
     ContactPlantCopy,
+    classify_tool_proximity,
     contact_and_plant_rates_into,
     contact_wrench_W,
     environment_wrench_about_Wo_into,
-    tool_proximity,
 )
 from drake_teleop.station.slave.posture_shapes import start_overlap_texts
 from drake_teleop.station.slave.scene import Scene
@@ -179,7 +179,7 @@ def test_a_drawer_is_not_a_leaf_for_the_states_between_steps(tmp_path, depth):
     state = slave.plant.GetPositionsAndVelocities(slave.plant.CreateDefaultContext())
     x = np.concatenate([slave.start, np.zeros(n + 2), state])
     xdot, none = np.zeros(2 * n + 2), np.zeros(6)
-    contact_and_plant_rates_into(slave.physics_of_plant, x, np.zeros(n), none, wrench_W, xdot)
+    contact_and_plant_rates_into(slave.compiled_constants, x, np.zeros(n), none, wrench_W, xdot)
     assert np.linalg.norm(wrench_W[:3]) > 1.0
     assert xdot[n] == xdot[-1] == 0.0
 
@@ -327,7 +327,7 @@ def test_wrist_wrench_is_the_reaction_for_every_environment(case, pad):
         return
     # Its log has the leaf, and no other body moves.
     assert station.HasOutputPort("sheet_state")
-    assert "has more than a sheet spring" in sensor.reason_beyond_contact_law
+    assert "sheet spring is not the only object" in sensor.reason_beyond_contact_law
 
 
 def test_drake_computes_unmodelled_contacts_between_the_steps(monkeypatch):
@@ -378,7 +378,9 @@ def test_separation_of_tool_and_unmodelled_shapes():
         for row in rows:
             row[:, 15] += height
         nothing = np.zeros(2)
-        found.append(tool_proximity(built.arm.table, *rows, joints, built.start, nothing, nothing))
+        found.append(
+            classify_tool_proximity(built.arm.table, *rows, joints, built.start, nothing, nothing)
+        )
     assert found == [
         PROXIMITY_FAR,
         PROXIMITY_TOUCHING,
@@ -568,7 +570,7 @@ def test_limits_and_friction_of_a_scene_without_effect_are_stated(tmp_path, limi
     _, texts = start_overlap_texts(Slave(), Scene(file=str(tmp_path / "mine.sdf")))
     stated = [each for each in texts if each.startswith("mine.sdf: no ")]
     expected = ["dry friction"] * (friction > 0.0) + ["position limits"] * (limit < 1e4)
-    assert stated == [f"mine.sdf: no {x}, which the model has, of hinge" for x in expected]
+    assert stated == [f"mine.sdf: no effect of the {x} in the file on hinge" for x in expected]
 
 
 def test_moving_bodies_with_similar_names_have_different_names(tmp_path):
@@ -666,7 +668,7 @@ def test_moving_body_without_mass_is_one_error(tmp_path):
 def test_a_scene_is_found_from_the_scenarios_folder(tmp_path):
     (tmp_path / "mine.yaml").write_text("environment: [!Scene {file: pad.sdf}, !Scene {}]")
     absent = LoadScenario(tmp_path / "mine.yaml").surroundings
-    with pytest.raises(DrakeTeleopError, match=r"pad\.sdf: there is no such file"):
+    with pytest.raises(DrakeTeleopError, match=r"pad\.sdf: file does not exist"):
         AddSlavePlant(DiagramBuilder(), Slave(), absent)
     (tmp_path / "pad.sdf").write_text(SOFT_PAD)
     (found, shipped) = LoadScenario(tmp_path / "mine.yaml").environment

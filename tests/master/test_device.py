@@ -40,7 +40,7 @@ def acceleration(q, v, wrench, torque, parameters) -> np.ndarray:
 def main_mass_matrix(q) -> np.ndarray:
     """Return the mass matrix (3, 3) of the main axes without wrist, motors and hand."""
     M = np.empty((6, 6))
-    phantom._main_axes_mass_matrix_into(q, M)
+    phantom._mass_matrix_of_joints_1_to_3_into(q, M)
     return M[:3, :3]
 
 
@@ -49,8 +49,8 @@ def main_gravity(q) -> np.ndarray:
     return np.array(
         [
             0.0,
-            phantom._GRAVITY_TORQUE_2_N_M * np.cos(q[1]),
-            phantom._GRAVITY_TORQUE_3_N_M * np.sin(q[2]),
+            phantom._JOINT_2_GRAVITY_N_M * np.cos(q[1]),
+            phantom._JOINT_3_GRAVITY_N_M * np.sin(q[2]),
         ]
     )
 
@@ -58,8 +58,8 @@ def main_gravity(q) -> np.ndarray:
 def potential_energy(q) -> float:
     """Return the potential energy of device and wrist [J]."""
     weight = phantom.WRIST_MASS_KG * phantom.GRAVITY_M_S2
-    height = (phantom._GRAVITY_TORQUE_2_N_M + weight * phantom.L1) * np.sin(q[1])
-    return height - (phantom._GRAVITY_TORQUE_3_N_M + weight * phantom.L2) * np.cos(q[2])
+    height = (phantom._JOINT_2_GRAVITY_N_M + weight * phantom.L1) * np.sin(q[1])
+    return height - (phantom._JOINT_3_GRAVITY_N_M + weight * phantom.L2) * np.cos(q[2])
 
 
 def energy(state, hand_mass=0.0, hand_inertia=0.0) -> float:

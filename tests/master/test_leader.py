@@ -206,7 +206,7 @@ def test_joints_have_end_stops():
     assert np.isfinite(q).all()
     assert (q > limits[0] - 0.1).all() and (q < limits[1] + 0.1).all()
     beyond = np.clip(q, *limits) + np.where(q > 0, 1e-9, -1e-9)
-    assert device.is_any_axis_at_end_stop(
+    assert device.flag_samples_at_end_stop(
         np.array([HOME, np.maximum(beyond, limits[1] + 1e-6)])
     ).tolist() == [
         False,
@@ -271,8 +271,8 @@ def test_station_ports_and_file_path_relative_to_scenario(tmp_path):
         ),
         (
             dataclasses.replace(LEADER, package_paths=["none"]),
-            "no folder none for its packages; correct --package-path, or package_paths in slave or"
-            " master.leader",
+            "the package folder none does not exist; correct --package-path, or package_paths in"
+            " slave or master.leader",
         ),
         (dataclasses.replace(LEADER, friction=[1.0]), "the friction stops the haptic device"),
     ],

@@ -123,9 +123,9 @@ def test_end_of_workspace_is_reported_and_start_beyond_rejected():
     wobbling = inside + 1e-3 * np.eye(6)[5]
     for model, ends in ((fixed, [False, False, True]), (omega, [False, False, True])):
         np.testing.assert_array_equal(
-            model.is_any_axis_at_end_stop(np.array([inside, wobbling, aside])), ends
+            model.flag_samples_at_end_stop(np.array([inside, wobbling, aside])), ends
         )
-    np.testing.assert_array_equal(omega.is_any_axis_at_end_stop(np.array([turned])), [True])
+    np.testing.assert_array_equal(omega.flag_samples_at_end_stop(np.array([turned])), [True])
     for pose in (aside, turned):
         with pytest.raises(DrakeTeleopError, match="the device's workspace is"):
             omega.inverse_kinematics(omega.forward_kinematics(pose))

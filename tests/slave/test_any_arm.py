@@ -29,11 +29,11 @@ from drake_teleop.station.signals import SIGNALS
 from drake_teleop.station.simulation import MakeSimulator, simulate
 from drake_teleop.station.slave.arm import ROTOR_COLUMN
 from drake_teleop.station.slave.chain_joints import AddSkeleton
-from drake_teleop.station.slave.joint_commands import JointRangeMonitor, used_ik_method
+from drake_teleop.station.slave.joint_commands import JointRangeMonitor, pick_ik_method
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.numeric_inverse_kinematics import NumericInverseKinematics
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave, ParseSlave, start_pose
-from drake_teleop.station.slave.slave_config import Ball, Block, Slave, Tool, tip_of_tool_shapes
+from drake_teleop.station.slave.slave_config import Ball, Block, Slave, Tool, p_STip_of_shapes
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 HOME = [0.3, 0.4, -0.2, 0.1, 0.5, -0.3, 0.2]
@@ -143,14 +143,14 @@ def test_start_pose_and_assumptions(scenario):
 def test_arm_with_rx90_geometry_uses_closed_form():
     copy = Slave(model=str(models_dir() / "rx90.sdf"))
     arm = NominalSlave(copy).arm
-    assert used_ik_method("automatic", arm) == "closed_form"
+    assert pick_ik_method("automatic", arm) == "closed_form"
     np.testing.assert_array_equal(NominalSlave(copy).start, NominalSlave(Slave()).start)
     np.testing.assert_array_equal(NominalSlave(copy).tip, [0.0, 0.0, 0.2])
     moved = Slave(base_pose=[0.1, -0.2, 0.3, 0.0, 0.0, 0.5])
     arm = NominalSlave(moved).arm
-    assert used_ik_method("automatic", arm) == "numeric"
+    assert pick_ik_method("automatic", arm) == "numeric"
     with pytest.raises(DrakeTeleopError, match="closed form requires the geometry of an RX90"):
-        used_ik_method("closed_form", arm)
+        pick_ik_method("closed_form", arm)
     plant, context = NominalSlave(moved).plant, NominalSlave(moved).plant.CreateDefaultContext()
     found = plant.GetFrameByName("sensor").CalcPoseInWorld(context)
     np.testing.assert_allclose(found.translation(), [0.55, 0.0, 0.45], atol=1e-8)
@@ -315,7 +315,7 @@ def test_arm_without_visuals_is_shown_as_sticks(scenario):
         ({"torque_limits": {"knee": 5.0}}, "the arm has no joint 'knee'; name one of j1, j2"),
         ({"torque_limits": {"j4": 0.0}}, "torque_limits.j4: 0 N m, N is outside 1e-06 to inf"),
         ({"sensor_frame": "finger"}, "no body with a mass is attached to finger"),
-        ({"model": "absent.urdf"}, "absent.urdf: there is no such file"),
+        ({"model": "absent.urdf"}, "absent.urdf: file does not exist"),
         ({"tool": Tool(model="a.sdf", mass=1.0)}, "tool.mass: a model file and a mass both define"),
         ({"tool": Tool(shapes=[Ball()])}, "require a mass"),
         ({"tool": Tool(mass=1.0, inertia=[1, 0, 0, 1, 0, 3])}, "the inertia is impossible"),
@@ -463,7 +463,7 @@ def test_tip_of_a_rotated_box_is_at_the_height_of_its_farthest_corner(rpy):
     corners = [box.pose @ (0.5 * np.array(x) * box.edges) for x in product((-1, 1), repeat=3)]
     tool = Tool(mass=1.0, shapes=[Ball(position=[0.0, 0.0, 0.1]), box])
     expected = [*box.position[:2], max(corner[2] for corner in corners)]
-    np.testing.assert_allclose(tip_of_tool_shapes(tool), expected, atol=1e-12)
+    np.testing.assert_allclose(p_STip_of_shapes(tool), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(("beyond", "stops"), [(0.005, False), (0.02, True), (np.nan, True)])

@@ -268,9 +268,9 @@ def test_leader_has_no_stops_at_endless_joints(tmp_path):
     np.testing.assert_array_equal(device.home, np.zeros(7))
     q = np.where(np.isinf(ARMS[SEVEN].upper), 50.0, 0.1)
     device.check_limits(q)
-    assert not device.is_any_axis_at_end_stop(q[np.newaxis]).any()
+    assert not device.flag_samples_at_end_stop(q[np.newaxis]).any()
     q[1] = 2.3
-    assert device.is_any_axis_at_end_stop(q[np.newaxis]).all()
+    assert device.flag_samples_at_end_stop(q[np.newaxis]).all()
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.slave.arm import (
-    ARM_FRICTION_TANH_SPEED_RAD_OR_M_S,
+    ARM_FRICTION_TANH_SPEED_SI,
     forward_dynamics,
     inverse_dynamics,
 )
@@ -55,7 +55,7 @@ def arm():
     return Arm(FRICTION)
 
 
-@pytest.mark.parametrize("speed", [0.3 * ARM_FRICTION_TANH_SPEED_RAD_OR_M_S, 0.4])
+@pytest.mark.parametrize("speed", [0.3 * ARM_FRICTION_TANH_SPEED_SI, 0.4])
 def test_friction_is_in_dynamics_but_not_in_computed_torque(arm, speed):
     """Computed torque does not compensate the friction."""
     random, table = np.random.default_rng(3), arm.slave.arm.table
@@ -65,7 +65,7 @@ def test_friction_is_in_dynamics_but_not_in_computed_torque(arm, speed):
         v, wanted = speed * random.normal(size=6), random.normal(size=6)
         inverse_dynamics(table, q, v, wanted, torque)
         arm.put(q, v, torque)
-        forward_dynamics(arm.slave.physics_of_plant[0], q, v, torque, np.zeros(6), compiled)
+        forward_dynamics(arm.slave.compiled_constants[0], q, v, torque, np.zeros(6), compiled)
         found = arm.acceleration()
         np.testing.assert_allclose(compiled, found, atol=1e-11 * np.abs(found).max())
         missing = np.empty(6)
@@ -117,7 +117,7 @@ def test_one_friction_value_applies_to_all_joints():
     for friction, expected in (([2.0], 6 * [2.0]), ([], 6 * [0.0])):
         builder = DiagramBuilder()
         slave = AddSlavePlant(builder, Slave(friction=friction), None)
-        np.testing.assert_array_equal(slave.physics_of_plant[0][:-1, 24], expected)
+        np.testing.assert_array_equal(slave.compiled_constants[0][:-1, 24], expected)
         assert len(builder.GetSystems()) == (2 if friction else 1)
 
 
@@ -144,7 +144,7 @@ def test_friction_may_stop_a_joint_within_half_of_the_shorter_step(rate, max_ste
     """Steps end at a change of the torque and are at most `max_step` long."""
     nominal = NominalSlave(Slave())
     slope = np.linalg.inv(mass_matrix(nominal.arm, nominal.start))
-    fastest = np.linalg.eigvals(slope).real.max() / ARM_FRICTION_TANH_SPEED_RAD_OR_M_S
+    fastest = np.linalg.eigvals(slope).real.max() / ARM_FRICTION_TANH_SPEED_SI
     timing = {"rates__joint_control_hz": rate, "simulation__max_step": max_step}
     largest = 2.0 / (fastest * step)
     MakeSlaveSide(replace(Scenario(), **timing, slave__friction=[0.99 * largest]))

@@ -96,7 +96,7 @@ def test_frames_and_classes_of_included_files_apply(tmp_path):
     np.testing.assert_allclose(
         pose(model, [0.7])[:, 3], [1, 0.4 * np.sin(0.7), 0.1 + 0.4 * np.cos(0.7)], atol=1e-12
     )
-    assert "named after its file: a" in said
+    assert "gets that of its file: a" in said
 
 
 @pytest.mark.parametrize(
@@ -322,7 +322,7 @@ def test_compiler_sets_the_mass(tmp_path, compiler, geoms, expected):
     text = mjcf(arm(inside=geoms, inertial="") + cup, f"<compiler {compiler}/>")
     _, model, said = read(written(tmp_path, text, "a.xml"), "S")
     np.testing.assert_allclose(model.table[:, PHI_COLUMN].sum(), expected)
-    assert "left out, because the arm does not carry it: a body without name" in said
+    assert "elements beside the arm are left out: a body without name" in said
 
 
 @pytest.mark.parametrize(("sensor", "beyond"), [("", 0.0), ("force", 3.0), ("torque", 3.0)])
@@ -365,27 +365,27 @@ BESIDE = (
     [
         (JOINT, FINGERS, "", "held: f, g"),
         (JOINT, FINGERS, '<equality><connect body1="f" body2="g" anchor="0 0 0"/></equality>',
-         "no effect of this equality on the arm: connect"),
+         "no effect on the arm of the equality constraint connect"),
         (JOINT, FINGERS, '<equality><joint joint1="f" joint2="j"/></equality>',
-         "no effect of this equality on the arm: f and j"),
+         "no effect on the arm of the equality constraint f and j"),
         (JOINT, "", '<equality><weld name="w" body1="S" body2="hand of god"/></equality>',
-         "no effect of this equality on the arm: w"),
+         "no effect on the arm of the equality constraint w"),
         (JOINT, "", '<tendon><fixed><joint joint="j" coef="1"/></fixed></tendon>',
-         "no tendon, which the model has, of j"),
-        (JOINT.replace("/>", ' stiffness="5"/>'), "", "", "no spring, which the model has, of j"),
-        (JOINT.replace("/>", ' frictionloss="5"/>'), "", "", "no dry friction, .* of j"),
-        (JOINT.replace("/>", ' damping="-0.01"/>'), "", "", "damping 0 in place of .* for j"),
+         "no effect of the tendons in the file on j"),
+        (JOINT.replace("/>", ' stiffness="5"/>'), "", "", "no effect of the spring in .* on j"),
+        (JOINT.replace("/>", ' frictionloss="5"/>'), "", "", "dry friction in .* on j"),
+        (JOINT.replace("/>", ' damping="-0.01"/>'), "", "", "damping is 0, not negative.* joint j"),
         (JOINT, '<geom type="mesh" mesh="none"/>', "", r"not found \(.*shapes are missing of b"),
         (JOINT, '<body name="flat"><inertial pos="0 0 0" mass="1" diaginertia="1 1 2.5"/></body>',
          "", r"warning: inertia replaced by the nearest .* of link flat \(6.67 %\)"),
         *((JOINT, f'<body name="flat">{INERTIAL.replace("0.02 0.02 0.02", f"1 1 {z}")}</body>', "",
            expected) for z, expected in (
-            (2.0045, "an inertia corrected for rounding of flat"),
+            (2.0045, "rounding errors in the inertia are corrected, of link flat"),
             (2.009, r"(^|; )inertia replaced by the nearest .* of link flat \(0.149 %\)"),
             (2.28, r"(^|; )inertia replaced by the nearest .* of link flat \(4.09 %\)"))),
         (JOINT, '<body name="p"><inertial pos="0 0 0" mass="0" diaginertia="1 1 1"/></body>', "",
-         "an inertia without a mass left out of p"),
-        (JOINT, "", '<option gravity="0 0 0"/>', r"gravity of 9.81 m/s\^2 instead of 0 0 0"),
+         "inertia is left out, because the mass is 0, of link p"),
+        (JOINT, "", '<option gravity="0 0 0"/>', r"gravity is 9.81 m/s\^2, not the file's 0 0 0"),
         (JOINT, '<geom type="hfield" hfield="h"/>', "", "hfield are not supported; .* of b"),
     ],
 )  # fmt: skip
@@ -393,7 +393,7 @@ def test_repair_is_stated(tmp_path, joint, inside, tail, expected):
     text = mjcf(arm(joint, inside) + BESIDE, tail=tail)
     _, model, said = read(written(tmp_path, text, "a.xml"), "S", shapes=True)
     assert re.search(expected, said)
-    assert "does not carry it: cup, hand of god" in said
+    assert "beside the arm are left out: cup, hand of god" in said
     np.testing.assert_allclose(pose(model, [0.3])[:, 3], [np.sin(0.3) / 2, 0, np.cos(0.3) / 2])
 
 
@@ -410,12 +410,12 @@ def test_held_joint_has_the_drawn_or_requested_pose(tmp_path):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (mjcf(arm(inside='<replicate count="2"/>')), "b contains <replicate>"),
+        (mjcf(arm(inside='<replicate count="2"/>')), "b contains the unsupported <replicate>"),
         (mjcf(arm("<joint name='j' type='ball'/>")), "j is a ball joint"),
         (mjcf(arm(JOINT * 2)), "several joints are named j"),
-        (mjcf(arm('<joint name="j" range="9 -9"/>')), "range from 9 to -9 is empty"),
-        (mjcf(arm('<joint name="j" axis="0 0 1e-200"/>')), "joint j: its axis is 0"),
-        (mjcf(arm('<joint name="j" class="none"/>')), "there is no class none"),
+        (mjcf(arm('<joint name="j" range="9 -9"/>')), "swap the ends of range, 9 to -9"),
+        (mjcf(arm('<joint name="j" axis="0 0 1e-200"/>')), "joint j: axis has length 0"),
+        (mjcf(arm('<joint name="j" class="none"/>')), "default class none is undefined"),
         (mjcf(arm(attributes='pos="0 0"')), "body b: pos '0 0' is not 3 numbers"),
         (mjcf(arm(attributes='pos="0 0 nan"')), "body b: pos '0 0 nan' is not a list"),
         (mjcf(arm(inertial=INERTIAL.replace('"2"', '"-2"'))), "body b: mass -2 kg is negative"),
@@ -480,10 +480,10 @@ def test_scene_keeps_its_bodies_and_refuses_what_drake_ignores(tmp_path):
     rough = mjcf(DOOR.format(' frictionloss="0.3" range="0 90"'))
     notes = ParseScene(MultibodyPlant(0.0), written(tmp_path, rough, "c.xml"))
     for what in ("dry friction", "position limits"):
-        assert f"no {what}, which the model has, of hinge" in notes
+        assert f"no effect of the {what} in the file on hinge" in notes
     for door, tail, expected in (
-        (DOOR.format(' stiffness="3"'), "", "no spring, .* of hinge"),
-        (DOOR.format(""), '<equality><weld body1="cup"/></equality>', "no coupling, .* by weld"),
+        (DOOR.format(' stiffness="3"'), "", "springs, .* lost: hinge"),
+        (DOOR.format(""), '<equality><weld body1="cup"/></equality>', "couplings .* lost: weld"),
         (DOOR.format("").replace('"box"', '"sdf"'), "", "shapes are missing of door"),
     ):
         with pytest.raises(DrakeTeleopError, match=expected):

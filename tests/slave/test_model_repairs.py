@@ -28,7 +28,7 @@ from drake_teleop.station.slave.model.model_numbers import (
 from drake_teleop.station.slave.model.model_repair import ModelPurpose, ModelRepair
 from drake_teleop.station.slave.model.urdf_and_sdf_repair import (
     _has_valid_colour,
-    find_dependence_reasons,
+    find_mimics_and_floating_links,
 )
 from drake_teleop.station.slave.models import ParseModel, ParseScene, translate_drake_errors
 from drake_teleop.station.slave.plant import NominalSlave
@@ -115,7 +115,7 @@ LOOKALIKES = {
     "arm with plugins, a loose cup and a floating base": (
         arm(l0=link("world", "") + link("l0") + joint(30, "floating", "", "world", "l0"),
             beyond=link("cup") + '<gazebo reference="l3"><kp>1</kp></gazebo><sensor/>'),
-        "^welded to the world, where it may float: l0; .* and left out: cup$"),
+        "^welded to the world instead of floating: l0; .* and left out: cup$"),
 }  # fmt: skip
 
 
@@ -283,7 +283,7 @@ def test_joint_of_the_chain_does_not_mimic_a_joint_beside_it(tmp_path):
     text = arm(j3=joint(3, inside='<mimic joint="j9" multiplier="-1"/>'), beyond=beside)
     _, model, said = read(written(tmp_path, text))
     assert model.joint_names == tuple(f"j{i}" for i in range(1, 7))
-    assert said.startswith("independent of the joint that it mimics, which does not move S: j3; ")
+    assert said.startswith("joint moves alone, as the joint that it mimics does not move S: j3; ")
     path = written(tmp_path, text)
     with pytest.raises(DrakeTeleopError, match=r"j3 moves with another joint"):
         read(path, hold={"j9": 0.3})  # which would not hold j3
@@ -347,9 +347,9 @@ TABLE = '<model name="table"><link name="top"/><joint name="x" type="gearbox"/><
     [
         (
             f"<world name='w'>{TABLE}<light/>{ARM_SDF}</world>",
-            "models beside the arm left out: table",
+            "models beside the arm are left out: table",
         ),
-        (f"{ARM_SDF}{TABLE}", "models beside the arm left out: table"),
+        (f"{ARM_SDF}{TABLE}", "models beside the arm are left out: table"),
         (ARM_SDF, "held: f"),
     ],
 )
@@ -359,7 +359,7 @@ def test_arm_is_taken_out_of_an_sdf(tmp_path, text, stated):
     assert stated in said
     assert "replaced by the nearest possible one" in said and "of link l1 (11.1 %)" in said
     assert "an impossible inertia left out, as no joint of the arm moves the link, of base" in said
-    assert "an inertia without a mass left out of hand" in said
+    assert "inertia is left out, because the mass is 0, of link hand" in said
     assert (model.lower[0], model.upper[0], model.effort_limit[0]) == (-1.0, 2.0, 30.0)
     assert plant.GetBodyByName("hand").default_mass() == 0.0
     X_BaseL1 = RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), [0, 0, 0.2])
@@ -375,7 +375,7 @@ def test_sdf_joint_with_the_name_of_a_link_gets_another(tmp_path, name):
     text = ARM_SDF.replace('<joint name="a"', f'<joint name="{name}"')
     path = written(tmp_path, f"<sdf version='1.7'>{text}</sdf>", "arm.sdf")
     _, model, said = read(path, "ft", shapes=True)
-    assert f"a new name for the joint {name} ({name}_1)" in said
+    assert f"a unique name for joint {name} ({name}_1)" in said
     assert model.joint_names == (f"{name}_1",) and model.effort_limit[0] == 30.0
 
 
@@ -513,7 +513,7 @@ def test_all_faults_are_listed_at_once(tmp_path):
 @pytest.mark.parametrize("origin", ['xyz="0 0.25"', 'xyz="0 0 a"', 'rpy="0 0 0 0"', 'xyz="${x}"'])
 def test_invalid_origin_of_the_chain_names_its_joint(tmp_path, origin):
     path = written(tmp_path, arm(j3=joint(3).replace('xyz="0 0 0.25"', origin)))
-    with pytest.raises(DrakeTeleopError, match=r"joint j3: origin \w+='.*' is no list of three"):
+    with pytest.raises(DrakeTeleopError, match=r"joint j3: \w+ of origin is '.*', not three"):
         read(path)
 
 
@@ -632,7 +632,7 @@ def test_coupled_joints_and_floating_links_are_dependent(inside, expected, paren
         f'<joint name="f" type="floating">{ends}</joint></r>'
     )
     floating = {} if parent == "world" else {"c": "floats on l2"}
-    assert find_dependence_reasons(root) == expected | floating
+    assert find_mimics_and_floating_links(root) == expected | floating
 
 
 @pytest.mark.parametrize(

@@ -110,7 +110,7 @@ def test_one_sample_equals_joint_control_exactly():
         scratch, line = np.zeros(3 * n), np.zeros(3 * n)
         computed_torque_into(slave.arm.table, command, state, *servo, scratch, torque)
         predict_torque_ramp(
-            slave.arm.table, command, state, np.zeros(2), servo, slave.physics_of_plant, 1, 5e-4,
+            slave.arm.table, command, state, np.zeros(2), servo, slave.compiled_constants, 1, 5e-4,
             scratch, line,
         )  # fmt: skip
         assert line.tobytes() == np.concatenate([torque, np.zeros(n), torque]).tobytes()
@@ -124,7 +124,7 @@ def test_line_stays_within_torque_limits_and_survives_invalid_command():
 
     def torques(command):
         predict_torque_ramp(
-            arm.table, command, rest, np.zeros(2), servo, slave.physics_of_plant, 5, 1e-4,
+            arm.table, command, rest, np.zeros(2), servo, slave.compiled_constants, 5, 1e-4,
             np.zeros(3 * n), line,
         )  # fmt: skip
         return line[:n], line[:n] + 5e-4 * line[n : 2 * n], line[2 * n :].copy()

@@ -41,7 +41,7 @@ from drake_teleop.station.scenario import Scenario, check_scenario, replace
 from drake_teleop.station.sensor.sensor_chain import without_parts
 from drake_teleop.station.simulation import MakeSimulator
 from drake_teleop.station.slave.arm import jacobian
-from drake_teleop.station.slave.joint_commands import AUTOMATIC_IK_METHOD, used_ik_method
+from drake_teleop.station.slave.joint_commands import AUTOMATIC_IK_METHOD, pick_ik_method
 from drake_teleop.station.slave.plant import ARM_INSTANCE_NAME, NominalSlave
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
@@ -180,7 +180,7 @@ class _PeriodSimulator:
         self._simulator.get_mutable_integrator().set_fixed_step_mode(True)
         slave = NominalSlave(smooth.slave)
         self._arm, self._joints = slave.arm.table, slave.arm.num_joints
-        self._has_ik_state = used_ik_method(smooth.slave.inverse_kinematics, slave.arm) == "numeric"
+        self._has_ik_state = pick_ik_method(smooth.slave.inverse_kinematics, slave.arm) == "numeric"
         self._push = ExternallyAppliedSpatialForce()
         self._push.body_index = slave.tool
         self._sensor = self._get_block("wrist_sensor")

@@ -19,7 +19,7 @@ from drake_teleop.lab.excitation.prediction import predicted_deviations
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.slave.arm import ArmModel
-from drake_teleop.station.slave.posture_shapes import joint_sampling_range
+from drake_teleop.station.slave.posture_shapes import random_posture_limits
 
 # Scale factors of trajectories that exceed a limit between the optimiser's samples.
 _AMPLITUDE_SHRINK_FACTORS = (1.0, 0.995, 0.99, 0.98)
@@ -97,7 +97,7 @@ def excite(
 
 def _num_sensor_rotation_axes(arm: ArmModel) -> int:
     # Axes in S: a SCARA arm has one, although it can rotate about several joints.
-    postures = np.random.default_rng(0).uniform(*joint_sampling_range(arm), (20, arm.num_joints))
+    postures = np.random.default_rng(0).uniform(*random_posture_limits(arm), (20, arm.num_joints))
     first, *others = (tuple(arm.pose(q)[:4]) for q in postures)
     inverse = vectors.conjugate_quaternion(first)
     axes = [vectors.quaternion_product(inverse, other)[1:] for other in others]

@@ -21,7 +21,7 @@ from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.posture_shapes import PostureShapes, overlap_warnings
 from drake_teleop.station.slave.slave_config import Ball, Slave, Tool
 
-_DEFAULT_MASTER_WORKSPACE_HALF_EDGE_M = 0.08  # of the cube around the default start (E)
+_DEFAULT_MASTER_WORKSPACE_HALF_EDGE_M = 0.08  # of the cube around the default start, estimate
 # Stand-in for a missing tool: masses [kg], of which the arm holds the first with less than this
 # share of its torques; centre of mass, length and radius of the ball [m]; free length of the rod.
 _STAND_IN_TOOL_MASSES_KG = (1.0, 0.5, 0.2, 0.1, 0.05)

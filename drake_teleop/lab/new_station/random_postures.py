@@ -16,7 +16,7 @@ from drake_teleop.station.slave.arm import (
     ArmModel,
 )
 from drake_teleop.station.slave.numeric_inverse_kinematics import orientation_weight_m
-from drake_teleop.station.slave.posture_shapes import joint_sampling_range
+from drake_teleop.station.slave.posture_shapes import random_posture_limits
 
 NUM_RANDOM_POSTURES = 20_000
 _MIN_COS_TOOL_TILT = np.cos(np.radians(40.0))  # largest tilt of the tool axis from vertical
@@ -110,7 +110,7 @@ def postures_at(arm: ArmModel, q: Array) -> Postures:
 
 
 def random_postures(arm: ArmModel) -> Postures:
-    lower, upper = joint_sampling_range(arm)
+    lower, upper = random_posture_limits(arm)
     random = np.random.default_rng(0)
     return postures_at(arm, random.uniform(lower, upper, (NUM_RANDOM_POSTURES, arm.num_joints)))
 

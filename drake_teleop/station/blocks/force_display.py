@@ -10,7 +10,7 @@ from drake_teleop.common.errors import expect_type
 from drake_teleop.common.numeric import Array, finite_array
 from drake_teleop.station.master import force_display as display
 from drake_teleop.station.master.dynamics import HapticDevice
-from drake_teleop.station.master.force_display import DISPLAYED_WRENCH_SLOTS
+from drake_teleop.station.master.force_display import DISPLAYED_WRENCH_SLICE
 from drake_teleop.station.stepped_block import SteppedBlock
 
 
@@ -46,8 +46,8 @@ class ForceDisplay(SteppedBlock):
         self._position = self.DeclareVectorInputPort("joint_position", 6)
         self._declare_step([memory], 1, period)
         self._declare_output("joint_torque", 0, slice(0, 6))
-        self._declare_output("force_to_master", 0, DISPLAYED_WRENCH_SLOTS)
-        fault = DISPLAYED_WRENCH_SLOTS.stop
+        self._declare_output("force_to_master", 0, DISPLAYED_WRENCH_SLICE)
+        fault = DISPLAYED_WRENCH_SLICE.stop
         self._declare_output("fault_at_hand", 0, slice(fault, fault + 1))
 
     def _advance_states_and_outputs(self, context: Context, results: list[Array]) -> None:

@@ -15,7 +15,7 @@ from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, QuaternionFloa
 
 
 class FloorStand(NamedTuple):
-    """Box on the floor that 3D replays show below an object: sizes and centre in W [m]."""
+    """Box on the floor that 3D replays show below an object: sizes along, and centre in, W [m]."""
 
     size_x: float
     size_y: float
@@ -34,7 +34,7 @@ class Environment(ABC):
     @property
     @abstractmethod
     def slip_speed(self) -> float:
-        """Sliding speed above which friction is full [m/s]; the plant uses the smallest one."""
+        """Sliding speed from which friction is full [m/s]; the lowest of all objects applies."""
 
     @abstractmethod
     def AddTo(self, plant: MultibodyPlant) -> None:
@@ -43,7 +43,7 @@ class Environment(ABC):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: geometry.SceneGraph, tool: BodyIndex
     ) -> None:
-        """Exclude contact pairs, or replace contact materials of the tool, after Finalize."""
+        """Exclude pairs from contact, or replace the tool's contact materials, after Finalize."""
         return
 
     def check(self, where: str) -> None:
@@ -61,9 +61,9 @@ class Environment(ABC):
 
     @property
     def moving_part(self) -> tuple[float, float, float] | None:
-        """Mass [kg], stiffness [N/m] and damping [N s/m] of a body on a prismatic spring, or None.
+        """Mass [kg], stiffness [N/m], damping [N s/m] of the body on a sprung prismatic joint.
 
-        The position of its joint is 0 without load.
+        Its joint position is 0 without load. None: no such body.
         """
         return None
 
@@ -146,13 +146,13 @@ def ExcludeContact(
 
 
 def ContactMaterial(
-    stiffness: float, dissipation: float, friction: float, old: ProximityProperties | None = None
+    stiffness: float, dissipation: float, friction: float, former: ProximityProperties | None = None
 ) -> ProximityProperties:
-    """Return a material for point contact, with the hydroelastic properties of `old`, if any.
+    """Return properties for point contact; hydroelastic ones are copied from `former`.
 
     Units: stiffness [N/m], Hunt-Crossley dissipation [s/m], friction coefficient [1].
     """
-    properties = ProximityProperties(old or ProximityProperties())
+    properties = ProximityProperties(former or ProximityProperties())
     for name in ("point_contact_stiffness", "hunt_crossley_dissipation", "coulomb_friction"):
         properties.RemoveProperty("material", name)
     law = CoulombFriction(friction, friction)

@@ -30,7 +30,7 @@ from drake_teleop.common.vectors import (
 _FIXED_JOINT, _REVOLUTE_JOINT, _PRISMATIC_JOINT, _FREE_JOINT = range(4)
 _PARENT_ROW_COLUMN, _JOINT_TYPE_COLUMN, _POSITION_INDEX_COLUMN, _VELOCITY_INDEX_COLUMN = range(4)
 _AXIS_COLUMN, _X_PF_COLUMN, _X_MB_COLUMN = 4, 7, 14
-NUM_JOINT_COLUMNS = 21
+NUM_JOINT_TABLE_COLUMNS = 21
 #: Numbers of a body: q_WB (4), p_WB (3), omega_WB_W (3), v_WB_W (3).
 BODY_STATE_SIZE = 13
 
@@ -38,7 +38,7 @@ BODY_STATE_SIZE = 13
 def MakeJointTableAndRowBodies(
     plant: MultibodyPlant, bodies: Iterable[tree.BodyIndex]
 ) -> tuple[Array, list[int]]:
-    """Return a table (m, 21) of joints from world to `bodies`, and the body index of each child."""
+    """Return a table (m, 21) of m joints from world to `bodies`, and each row's child body."""
     # Parents first. Columns: 0 row of the parent, -1 if it is anchored; 1 type of joint; 2 and 3
     # first index of positions and velocities in the state [q; v]; 4-6 axis; 7-13 X_PF (X_WF for an
     # anchored parent) and 14-20 X_MB, a quaternion and a position each.
@@ -60,11 +60,11 @@ def MakeJointTableAndRowBodies(
     for number in order:
         index, parent = above[number]
         row = order.index(parent) if parent in order else -1
-        rows.append(_joint_row(plant, context, plant.get_joint(tree.JointIndex(index)), row))
-    return np.array(rows).reshape(len(rows), NUM_JOINT_COLUMNS), order
+        rows.append(_table_row(plant, context, plant.get_joint(tree.JointIndex(index)), row))
+    return np.array(rows).reshape(len(rows), NUM_JOINT_TABLE_COLUMNS), order
 
 
-def _joint_row(plant: MultibodyPlant, context: Context, joint: tree.Joint, parent: int) -> Array:
+def _table_row(plant: MultibodyPlant, context: Context, joint: tree.Joint, parent: int) -> Array:
     F = joint.frame_on_parent()
     X_PF = F.CalcPoseInWorld(context) if parent < 0 else F.GetFixedPoseInBodyFrame()
     X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
@@ -84,8 +84,8 @@ def _joint_row(plant: MultibodyPlant, context: Context, joint: tree.Joint, paren
 def poses_and_twists_into(joints, state, out):
     """Write pose and twist of m bodies at the plant's state [q; v] into `out` (m, 13).
 
-    A row is [q_WB (4), p_WB (3), omega_WB_W (3), v_WB_W (3)]; `MakeJointTableAndRowBodies`
-    returns `joints`.
+    A row is [q_WB (4), p_WB (3), omega_WB_W (3), v_WB_W (3)]; `joints` (m, 21) is the table of
+    `MakeJointTableAndRowBodies`.
     """
     still = (0.0, 0.0, 0.0)
     for k, row in enumerate(joints):
@@ -144,8 +144,8 @@ def _quaternion_derivative(omega, q):
 def interpolate_joint_state(joints, h, u, start, end, out):
     """Write the state [q; v] at the fraction u (0 to 1) of a step of h [s] into `out`.
 
-    Hermite cubics connect the plant's states `start` and `end` of the step;
-    `MakeJointTableAndRowBodies` returns `joints`.
+    Hermite cubics connect the plant's states `start` and `end` of the step; `joints` (m, 21) is
+    the table of `MakeJointTableAndRowBodies`.
     """
     for row in joints:
         q, v = int(row[_POSITION_INDEX_COLUMN]), int(row[_VELOCITY_INDEX_COLUMN])

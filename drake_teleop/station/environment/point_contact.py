@@ -1,9 +1,9 @@
 """Compiled copy of Drake's compliant point contact, for spheres of the tool on boxes.
 
-With depth x, stiffness k, dissipation d, slip velocity v_t, friction coefficient mu, and slip speed
-v_s of full friction::
+Depth x, stiffness k, dissipation d, slip velocity v_t; the friction coefficient mu is a function of
+s = |v_t| / v_s with the speed v_s of full friction::
 
-    f_n = k x (1 + d dx/dt) >= 0;   f_t = -mu(|v_t| / v_s) f_n v_t / |v_t|
+    f_n = k x (1 + d dx/dt) >= 0;   f_t = -mu(s) f_n v_t / |v_t|
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class ShapePairs(NamedTuple):
     """Pairs of a shape of the tool and a shape of the environment that may touch.
 
     Attributes:
-        compiled_pairs: (k, 28), pairs of a sphere of the tool and a box, with their contact law.
-        monitored_pairs: (l, 40), bounding boxes of the other pairs, which have no compiled law.
+        compiled_pairs: (k, 28), pairs of a tool sphere and a box: shapes, poses, contact law.
+        monitored_pairs: (l, 40), bounding boxes of other pairs, whose contact Drake computes.
         monitoring_reason: why the first pair of `monitored_pairs` is not in `compiled_pairs`.
     """
 
@@ -72,7 +72,7 @@ def FindContactPairs(
     """Return the pairs of tool and environment shapes that no collision filter excludes.
 
     Args:
-        tool: for each shape of the tool, the pose X_SBody of the shape's body.
+        tool: pose in S of the body that carries the shape, by shape of the tool.
         environment: model instances of the objects to touch.
         slip_speed: sliding speed above which friction is full [m/s].
         row_bodies: body index of each row of a joint table (`MakeJointTableAndRowBodies`).
@@ -97,10 +97,10 @@ def FindContactPairs(
                 X_SShape = X_SOwn @ inspector.GetPoseInFrame(own)
                 try:
                     sphere, edges = _require_sphere_and_box(inspector, own, other)
-                    law = _combined_contact_law_parameters(inspector, own, other)
+                    law = _stiffness_damping_and_frictions(inspector, own, other)
                     last = [direction, law, [slip_speed, row]]
                     place, half = [X_SShape.translation(), [sphere.radius()]], edges.size() / 2
-                    compiled_pairs.append(_shape_pair_row(place, X_Other, half, last))
+                    compiled_pairs.append(_make_pair_row(place, X_Other, half, last))
                 except DrakeTeleopError as beyond:
                     monitoring_reason = monitoring_reason or str(beyond)
                     own_box, box = _bounding_box(inspector, own), _bounding_box(inspector, other)
@@ -108,13 +108,13 @@ def FindContactPairs(
                     place = [X_SBox.translation(), [0.0]]
                     turned = [X_SBox.rotation().matrix().ravel(), own_box.half_width()]
                     last = [direction, [0.0] * 4, [slip_speed, row], *turned]
-                    monitored_pairs.append(_shape_pair_row(place, X_Other, box.half_width(), last))
+                    monitored_pairs.append(_make_pair_row(place, X_Other, box.half_width(), last))
     compiled = np.reshape(compiled_pairs, (len(compiled_pairs), NUM_PAIR_COLUMNS))
     monitored = np.reshape(monitored_pairs, (len(monitored_pairs), NUM_MONITORED_COLUMNS))
     return ShapePairs(compiled, monitored, monitoring_reason)
 
 
-def _shape_pair_row(
+def _make_pair_row(
     tool_columns: list[Any], X_Box: RigidTransform, half_edges: Array, law_columns: list[Any]
 ) -> Array:
     pose = X_Box.rotation().matrix().ravel(), X_Box.translation()
@@ -151,7 +151,7 @@ def _prismatic_joint_direction_W(plant: MultibodyPlant, context: Context, body: 
     return np.zeros(3)
 
 
-def _combined_contact_law_parameters(
+def _stiffness_damping_and_frictions(
     inspector: SceneGraphInspector, ball: GeometryId, box: GeometryId
 ) -> list[float]:
     names = "point_contact_stiffness", "hunt_crossley_dissipation", "coulomb_friction"
@@ -175,9 +175,9 @@ def depth_of_sphere_in_box(
 
     Args:
         pair: (28,) row of `ShapePairs.compiled_pairs`.
+        p_WS, R_WS: pose of the sensor frame, to which the sphere is fixed.
         deflection: deflection of the sheet spring [m].
-        normal_and_point: (6,) output, written if they touch: direction out of the box in W
-            (3), point of contact in W [m] (3).
+        normal_and_point: (6,) output for touching shapes, in W: outward normal, contact point [m].
     """
     radius = pair[3]
     # Centre of the sphere relative to the box, in W.
@@ -223,9 +223,9 @@ def lower_bound_of_box_distance(
 ) -> float:
     """Return a lower bound of the distance between two boxes [m], below 0 if they may touch.
 
-    `pair` (40,) is a row of `ShapePairs.monitored_pairs`; `box` (28,) is its first part with the
-    present pose of the environment's box. The bound is the largest gap between the boxes'
-    projections on the directions of all edges.
+    `pair` (40,) is a row of `ShapePairs.monitored_pairs`; `box` (28,) are its first columns with
+    the environment's box at its present pose. p_WS, R_WS are the sensor's pose, `deflection` [m]
+    that of the leaf. The bound is the largest gap of projections on edge directions.
     """
     R, between = matrix_as_tuple(R_WS), minus(vector_at(p_WS, 0), vector_at(box, 13))
     between = plus(between, apply_matrix(R, vector_at(pair, 0)))
@@ -262,9 +262,8 @@ def point_contact_force_into(
 ) -> None:
     """Write the contact force on a sphere in a box into `force` (3,) [N], in W.
 
-    `pair` is a row of `ShapePairs.compiled_pairs`, `depth` [m] the penetration, `normal` the
-    direction out of the box, `velocity` that of the sphere at the contact, relative to the box
-    [m/s].
+    `pair` is a row of `ShapePairs.compiled_pairs`, `depth` [m] the penetration; `normal` points out
+    of the box. `velocity` [m/s] is that of the sphere at the contact, relative to the box.
     """
     out = dot(velocity, normal)
     f_n = max(pair[22] * depth * (1.0 - pair[23] * out), 0.0)

@@ -1,4 +1,4 @@
-"""Sheet spring of the paper's Fig. 5: a leaf, clamped at one end, that the tool touches."""
+"""Sheet spring (paper, Fig. 5): a leaf, clamped at one end, that the tool touches."""
 
 from dataclasses import dataclass
 from xml.etree import ElementTree
@@ -14,7 +14,7 @@ from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.files import models_dir
 from drake_teleop.station.environment import environment
 
-_BENCH_BOTTOM_TO_LEAF_HEIGHT_M = 0.15  # from the lower face of the model's bench to the leaf [m]
+_LEAF_HEIGHT_ABOVE_BENCH_M = 0.15  # from the lower face of the model's bench to the leaf [m]
 
 
 @settings
@@ -23,23 +23,25 @@ class SheetSpring(environment.Environment):
     """Settings of the sheet spring: position, size and material of its leaf."""
 
     position: list[float] = quantity(
-        [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WLeaf, unloaded leaf's top, 25 mm from its free end"
+        [0.55, 0.0, 0.15], "m", -2.0, 2.0, "point on leaf's upper face at rest, 25 mm from its end"
     )
     length: float = quantity(0.170, "m", 0.02, 1.0, "free length of the leaf")
     width: float = quantity(
-        0.060, "m", 0.005, 0.5, "width of the section; the touched face remains 170 x 60 mm"
+        0.060, "m", 0.005, 0.5, "leaf width, for stiffness and mass; contact face: 170 x 60 mm"
     )
-    thickness: float = quantity(0.002, "m", 0.0002, 0.02, "thickness of the section")
+    thickness: float = quantity(0.002, "m", 0.0002, 0.02, "thickness of the leaf")
     youngs_modulus: float = quantity(210e9, "Pa", 1e9, 500e9, "Young's modulus, spring steel")
     density: float = quantity(7850.0, "kg/m^3", 500.0, 20000.0, "density, spring steel")
     damping_ratio: float = quantity(
-        0.03, "1", 0.0, 100.0, "damping ratio of the first mode; above 1 the leaf creeps back"
+        0.03, "1", 0.0, 100.0, "damping ratio of the first bending mode; above 1: overdamped"
     )
-    slip_speed: float = quantity(1e-4, "m/s", 1e-6, 1.0, "friction is full above this speed (E)")
+    slip_speed: float = quantity(
+        1e-4, "m/s", 1e-6, 1.0, "sliding speed from which friction has its full value (estimate)"
+    )
 
     @property
     def stiffness(self) -> float:
-        """Stiffness at the free end, 3 E I / L^3 [N/m], with I = b h^3 / 12 (Euler-Bernoulli)."""
+        """Stiffness at the free end, 3 E I / L^3 [N/m]; I = width thickness^3 / 12."""
         second_moment = self.width * self.thickness**3 / 12
         return 3 * self.youngs_modulus * second_moment / self.length**3
 
@@ -53,7 +55,7 @@ class SheetSpring(environment.Environment):
         return 2 * self.damping_ratio * np.sqrt(self.stiffness * self.effective_mass)
 
     @property
-    def max_linear_deflection(self) -> float:
+    def max_deflection_of_linear_model(self) -> float:
         """Largest deflection for which the linear model is valid, 10 % of the length [m]."""
         return 0.1 * self.length
 
@@ -64,7 +66,7 @@ class SheetSpring(environment.Environment):
     @property
     def floor_stand(self) -> environment.FloorStand:
         x, y, z = self.position
-        return environment.FloorStand(0.34, 0.24, x + 0.065, y, z - _BENCH_BOTTOM_TO_LEAF_HEIGHT_M)
+        return environment.FloorStand(0.34, 0.24, x + 0.065, y, z - _LEAF_HEIGHT_ABOVE_BENCH_M)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         """Add the leaf to a plant; its joint "bending" deflects the free end along z_W [m]."""

@@ -2,7 +2,7 @@ r"""Chamfered slot for the tool as a peg; all parts are fixed.
 
 Section across the slot, M is the middle of its mouth, z up::
 
-    top                       top        2 sides of y_M with 3 boxes each, and the floor. A ball
+    top                       top        At +y_M and -y_M 3 boxes each, and the floor. A ball
     ------.       M       .------        on an edge of two boxes touches both, so an edge is up to
            \.     |     ./  chamfer      twice as stiff as a face. The slot is open at its ends.
              |    |    |
@@ -31,9 +31,9 @@ from drake_teleop.station.environment.environment import (
 )
 
 #: Balls of the peg [m]: radius, and z_S of the centres. The first is that of tool.sdf. The second
-#: (E) is as high as the nut above it permits in the deepest slot.
+#: (estimate) is as high as the nut above it permits in the deepest slot.
 PEG_RADIUS_M, TIP_BALL_CENTRE_Z_S_M, UPPER_BALL_CENTRE_Z_S_M = 0.012, 0.188, 0.158
-#: Blocks on both sides [m]: length along the slot, width beyond the mouth's edge (E).
+#: Blocks on both sides [m]: length along the slot, width beyond the mouth's edge (estimate).
 SLOT_LENGTH_M, _SIDE_BLOCK_WIDTH_M = 0.10, 0.04
 _SLOT_FLOOR_THICKNESS_M = 0.02
 _SLOT_COLOUR_RGBA = np.array([0.30, 0.42, 0.58, 0.55])  # transparent, so that the peg is visible
@@ -43,23 +43,21 @@ _PEG_BALL_COLOUR_RGBA = np.array([0.86, 0.20, 0.12, 1.0])
 @settings
 @dataclass
 class Slot(Environment):
-    """Settings of the slot: pose, shape, and contact with the balls of the peg."""
+    """Settings of the slot; the peg's collision shapes are balls."""
 
-    position: list[float] = quantity([0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WM, middle of its mouth")
-    yaw: float = quantity(0.0, "rad", -3.15, 3.15, "angle of the slot about z_W; 0: along x_W")
-    clearance: float = quantity(1e-3, "m", 1e-6, 0.05, "width of the slot minus the peg's")
+    position: list[float] = quantity([0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_W, middle of its mouth")
+    yaw: float = quantity(0.0, "rad", -3.15, 3.15, "slot direction about z_W from x_W")
+    clearance: float = quantity(1e-3, "m", 1e-6, 0.05, "slot width minus peg diameter")
     depth: float = quantity(0.040, "m", 0.02, 0.05, "distance from mouth to floor")
     chamfer: float = quantity(
-        3e-3, "m", 5e-4, 0.015, "depth of the chamfers of 45 degrees, and their width on each side"
+        3e-3, "m", 5e-4, 0.015, "depth and width of each of the two chamfers of 45 degrees"
     )
     stiffness: float = quantity(
-        1e4, "N/m", 1e2, 1e6, "stiffness of a ball on a face, including part and fixture (E)"
+        1e4, "N/m", 1e2, 1e6, "stiffness of peg and slot with their supports, in series (estimate)"
     )
-    dissipation: float = quantity(
-        1.0, "s/m", 0.0, 100.0, "Hunt-Crossley dissipation of the contact, as of the leaf (E)"
-    )
+    dissipation: float = quantity(1.0, "s/m", 0.0, 100.0, "Hunt-Crossley dissipation (estimate)")
     friction: float = quantity(
-        0.2, "1", 0.0, 2.0, "friction coefficient of a ball on a face, at rest and in motion (E)"
+        0.2, "1", 0.0, 2.0, "static and dynamic friction coefficient of peg on slot (estimate)"
     )
 
     @property
@@ -114,8 +112,8 @@ class Slot(Environment):
             scene_graph.AssignRole(source, ball, material, RoleAssign.kReplace)
 
 
-def _slot_material(slot: Slot, old: ProximityProperties | None = None) -> ProximityProperties:
-    return ContactMaterial(2 * slot.stiffness, slot.dissipation, slot.friction, old)
+def _slot_material(slot: Slot, former: ProximityProperties | None = None) -> ProximityProperties:
+    return ContactMaterial(2 * slot.stiffness, slot.dissipation, slot.friction, former)
 
 
 def _boxes_of_slot(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:
@@ -124,7 +122,7 @@ def _boxes_of_slot(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:
     for name, side in (("left", 1.0), ("right", -1.0)):
 
         def block(inner: float, top: float, side: float = side) -> tuple[RigidTransform, Box]:
-            """Return pose and shape of a box from y `inner` outwards and z `top` to the floor."""
+            """Return a box at y side * `inner` [m] and beyond, from z = `top` down to the floor."""
             across, height = edge + c + _SIDE_BLOCK_WIDTH_M - inner, depth + top
             middle = RigidTransform([0.0, side * (inner + across / 2), top - height / 2])
             return middle, Box(SLOT_LENGTH_M, across, height)

@@ -34,18 +34,16 @@ _BLOCK_COLOUR_RGBA = np.array([0.30, 0.42, 0.58, 1.0])
 class Surface(Environment):
     """Base class of objects with contact stiffness, dissipation and friction of their surface.
 
-    In contact, Drake combines the stiffnesses of surface and tool as springs in series, and takes
-    the harmonic mean of their frictions. The tool's ball has stiffness 4e5 N/m and friction 0.2.
+    Contact has the stiffnesses of surface and tool in series, and the harmonic mean of their
+    frictions. The tool's ball has stiffness 4e5 N/m and friction 0.2.
     """
 
     stiffness: float = quantity(
-        1e4, "N/m", 1e2, 1e7, "stiffness of the surface, in series with the other body (E)"
+        1e4, "N/m", 1e2, 1e7, "contact stiffness, in series with that of the tool (estimate)"
     )
-    dissipation: float = quantity(
-        1.0, "s/m", 0.0, 100.0, "Hunt-Crossley dissipation d: damping k x d at depth x (E)"
-    )
+    dissipation: float = quantity(1.0, "s/m", 0.0, 100.0, "Hunt-Crossley dissipation (estimate)")
     friction: float = quantity(
-        0.2, "1", 0.0, 2.0, "friction coefficient; the harmonic mean with the tool's applies (E)"
+        0.2, "1", 0.0, 2.0, "friction coefficient; with the tool's, their harmonic mean (estimate)"
     )
 
     @property
@@ -73,7 +71,7 @@ class Box(Surface):
 def AddFixedBox(
     plant: MultibodyPlant, name: str, X_WBox: RigidTransform, size: list[float], surface: Surface
 ) -> None:
-    """Weld a box with edges `size` (3,) [m] to the world; its shape requires a scene graph."""
+    """Weld a box with edges `size` (3,) [m] to the world, without shape if no scene graph."""
     body = plant.AddRigidBody(name, NewInstance(plant, name), SpatialInertia.Zero())
     plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WBox)
     if plant.geometry_source_is_registered():
@@ -87,11 +85,11 @@ def AddFixedBox(
 class Wall(Surface):
     """Fixed flat wall with position, normal, size and surface."""
 
-    position: list[float] = quantity([0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WWall, middle of face")
-    normal: list[float] = quantity([0.0, 0.0, 1.0], "1", -1.0, 1.0, "outwards, in W, of any length")
+    position: list[float] = quantity([0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_W, middle of its face")
+    normal: list[float] = quantity([0.0, 0.0, 1.0], "1", -1.0, 1.0, "outward normal in W, any norm")
     size: list[float] = quantity(
-        [0.4, 0.4], "m", 1e-3, 4.0, "edges of the face, edge 2 along the world axis that is most"
-        " perpendicular to normal (the first of equal ones); the thickness is 0.1 m",
+        [0.4, 0.4], "m", 1e-3, 4.0, "edge lengths of the face; edge 2 is along the world axis that"
+        " is nearest to the face's plane (the first of equal ones); the wall is 0.1 m thick",
     )  # fmt: skip
 
     def check(self, where: str) -> None:
@@ -113,13 +111,13 @@ class Block(Surface):
     """Movable block with initial pose, size, mass and surface, and a table below it."""
 
     position: list[float] = quantity(
-        [0.6, 0.0, 0.2], "m", -2.0, 2.0, "the middle of its underside at the start, in W"
+        [0.6, 0.0, 0.2], "m", -2.0, 2.0, "p_W of the middle of the block's underside at the start"
     )
-    yaw: float = quantity(0.0, "rad", -3.15, 3.15, "angle of the block about z_W at the start")
+    yaw: float = quantity(0.0, "rad", -3.15, 3.15, "start yaw of the block about z_W")
     size: list[float] = quantity([0.1, 0.1, 0.1], "m", 0.01, 1.0, "lengths of its edges")
     mass: float = quantity(0.5, "kg", 0.01, 100.0, "mass of the block, evenly distributed")
     table: list[float] = quantity(
-        [0.5, 0.5], "m", 0.0, 4.0, "size of the table below it, of the same surface; 0: none"
+        [0.5, 0.5], "m", 0.0, 4.0, "edges x, y of a table with the block's surface; 0: no table"
     )
 
     def check(self, where: str) -> None:
@@ -157,7 +155,7 @@ class Block(Surface):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Exclude the tool's contact with the block's corner balls, other bodies' with its box."""
+        """Let the tool touch only the box of the block, other bodies only its corner balls."""
         bodies = [BodyIndex(index) for index in range(plant.num_bodies())]
         tool_bodies = BodiesWeldedToTool(plant, tool)
         around = [plant.get_body(index) for index in bodies if index not in tool_bodies]

@@ -1,4 +1,4 @@
-"""Settings of the haptic device: the paper's Phantom, data sheets by name, or a leader arm."""
+"""Settings of the haptic device: Phantom, data sheets by name, or a leader arm."""
 
 import dataclasses
 import math
@@ -25,7 +25,7 @@ _MAX_DEVICE_PITCH_RAD = 1.5
 @settings
 @dataclass
 class PhantomJointFriction:
-    """Friction torque of the Phantom's joints: coulomb * tanh(v / 0.01 rad/s) + viscous * v."""
+    """Settings of the Phantom's joint friction coulomb * tanh(v / 0.01 rad/s) + viscous * v."""
 
     # Sources as in `phantom`: main axes P, wrist estimated.
     coulomb: list[float] = quantity(
@@ -49,22 +49,22 @@ class DeviceFigures:
     turning_damping: float = quantity(5e-5, "N m s/rad", 0.0, 1.0, "viscous damping of rotation")
     peak_force: float = quantity(10.0, "N", 0.0, 500.0, "largest displayed force")
     peak_torque: list[float] = quantity(
-        [0.0, 0.0, 0.0], "N m", 0.0, 50.0, "largest torque about yaw, pitch, roll; one 0: no torque"
+        [0.0, 0.0, 0.0], "N m", 0.0, 50.0, "peak torque of yaw, pitch, roll; any at 0: no torque"
     )
     size: list[float] = quantity([0.15, 0.15, 0.15], "m", 1e-3, 2.0, "workspace along x, y, z")
     centre: list[float] = quantity(
-        [0.27, 0.0, 0.03], "m", -2.0, 2.0, "workspace centre, p_B; default: start of the scenarios"
+        [0.27, 0.0, 0.03], "m", -2.0, 2.0, "p_B of the workspace's middle; default: at the start"
     )
     turn: list[float] = quantity(
-        [1.2, 1.2, 2.4], "rad", 0.0, math.pi, "largest yaw, pitch (to 1.5), roll; both directions"
+        [1.2, 1.2, 2.4], "rad", 0.0, math.pi, "limits +- of yaw, pitch (at most 1.5), and roll"
     )
-    resolution: float = quantity(0.0, "m", 0.0, 0.01, "position step of the encoders; 0: exact")
-    turn_resolution: float = quantity(0.0, "rad", 0.0, 0.1, "rotation step of encoders; 0: exact")
-    rate_hz: float = quantity(0.0, "Hz", 0.0, 1e5, "update rate; 0 or over hand_hz: rates.hand_hz")
+    resolution: float = quantity(0.0, "m", 0.0, 0.01, "position step of the stylus; 0: exact")
+    turn_resolution: float = quantity(0.0, "rad", 0.0, 0.1, "rotation step of stylus; 0: exact")
+    rate_hz: float = quantity(0.0, "Hz", 0.0, 1e5, "update rate; 0: as rates.hand_hz, the maximum")
 
 
 _WRIST_TURN_RAD, _NO_TURN_RAD = DeviceFigures().turn, [0.0, 0.0, 0.0]
-_OMEGA_WORKSPACE_M = [0.11, 0.113, 0.113]  # workspace
+_OMEGA_BOX_EDGES_M = [0.11, 0.113, 0.113]  # workspace
 _OMEGA_MAX_TURN_RAD = np.radians([120.0, 70.0, 160.0]).tolist()
 _OMEGA_STEPS_AND_RATE = 1e-5, math.radians(0.09), 4000.0  # steps [m], [rad]; rate [Hz]
 
@@ -74,20 +74,20 @@ _OMEGA_STEPS_AND_RATE = 1e-5, math.radians(0.09), 4000.0  # steps [m], [rad]; ra
 # mass and friction of the Touch, turns and steps of the omegas, position steps of Touch and Falcon,
 # rates but the Inverse3's, and the Virtuose's torque. The rest are estimates.
 # Only the Virtuose displays torque; omega.3 and Falcon do not rotate.
-_DATA_SHEET_ROWS: dict[str, tuple[Any, ...]] = {
+_DATA_SHEET_VALUES: dict[str, tuple[Any, ...]] = {
     # name            kg     N     N     m                   rad         m        rad          Hz
     "geomagic_touch": (0.045, 0.26, 3.3, [0.07, 0.16, 0.12], _WRIST_TURN_RAD, 5.5e-5, 2e-3, 1000.0),
-    "omega_3": (0.25, 0.3, 12.0, _OMEGA_WORKSPACE_M, _NO_TURN_RAD, *_OMEGA_STEPS_AND_RATE),
-    "omega_6": (0.3, 0.3, 12.0, _OMEGA_WORKSPACE_M, _OMEGA_MAX_TURN_RAD, *_OMEGA_STEPS_AND_RATE),
-    "omega_7": (0.35, 0.3, 12.0, _OMEGA_WORKSPACE_M, _OMEGA_MAX_TURN_RAD, *_OMEGA_STEPS_AND_RATE),
+    "omega_3": (0.25, 0.3, 12.0, _OMEGA_BOX_EDGES_M, _NO_TURN_RAD, *_OMEGA_STEPS_AND_RATE),
+    "omega_6": (0.3, 0.3, 12.0, _OMEGA_BOX_EDGES_M, _OMEGA_MAX_TURN_RAD, *_OMEGA_STEPS_AND_RATE),
+    "omega_7": (0.35, 0.3, 12.0, _OMEGA_BOX_EDGES_M, _OMEGA_MAX_TURN_RAD, *_OMEGA_STEPS_AND_RATE),
     "falcon": (0.2, 0.5, 8.9, [0.102] * 3, _NO_TURN_RAD, 6.35e-5, 0.0, 1000.0),
     "haply_inverse3": (0.2, 0.15, 10.0, [0.2, 0.34, 0.19], _WRIST_TURN_RAD, 2e-5, 2e-3, 4000.0),
     "virtuose_6d": (1.0, 1.0, 35.0, [0.26] * 3, _WRIST_TURN_RAD, 2e-5, 2e-4, 1000.0),
 }  # fmt: skip
 _SHEET_FIELDS = "apparent_mass friction peak_force size turn resolution turn_resolution rate_hz"
-_figures_by_name = {
+_data_sheets_by_name = {
     name: DeviceFigures(**dict(zip(_SHEET_FIELDS.split(), row, strict=True)))
-    for name, row in _DATA_SHEET_ROWS.items()
+    for name, row in _DATA_SHEET_VALUES.items()
 }
 
 
@@ -96,7 +96,7 @@ class _DataSheetRegistry(Presets[DeviceFigures], Registry[DeviceFigures]):
 
 
 #: Data sheets by name, for `Master.figures`.
-FIGURES = _DataSheetRegistry("device", _figures_by_name, DeviceFigures)
+FIGURES = _DataSheetRegistry("device", _data_sheets_by_name, DeviceFigures)
 FIGURES["virtuose_6d"] = dataclasses.replace(
     FIGURES["virtuose_6d"], inertia=5e-3, friction_torque=0.03, peak_torque=[3.1] * 3
 )
@@ -109,19 +109,19 @@ class Master:
 
     model: str = choice(
         PHANTOM_NAME, (PHANTOM_NAME, "custom", LEADER_NAME),
-        "device; custom: defined by `figures`; leader: arm from a file", FIGURES,
+        "haptic device; custom: defined by `figures`; leader: by `leader`", FIGURES,
     )  # fmt: skip
     position: list[float] = quantity(
-        [0.27, 0.0, 0.03], "m", -0.5, 0.5, "p_BE at the start, in the device's base frame"
+        [0.27, 0.0, 0.03], "m", -0.5, 0.5, "p_BE of the stylus at the start, in the base frame B"
     )
     friction: PhantomJointFriction = field(default_factory=PhantomJointFriction)
     figures: DeviceFigures | None = plain(
-        None, "values that replace values of the device's data sheet; null: none replaced"
+        None, "data sheet that replaces that of `model`; null: not replaced"
     )
     leader: Leader | None = None
 
     def device(self, hand_mass: float, hand_inertia: float) -> HapticDevice | LeaderDevice:
-        """Return the device's dynamics with the hand's mass [kg] and inertia about E [kg m^2]."""
+        """Return the device with the hand's mass [kg] and inertia about each axis at E [kg m^2]."""
         if self.leader is not None:
             return self.leader.device(self.position, hand_mass, hand_inertia)
         pack = partial(pack_device_parameters, hand_mass=hand_mass, hand_inertia=hand_inertia)
@@ -153,7 +153,7 @@ class Master:
         return self.leader is not None and self.leader.leads == LEADER_JOINT_MODE
 
     def check_pose_mode(self, caller: str) -> None:
-        """Raise a DrakeTeleopError about `caller` if the leader arm is in joint mode (`leads`)."""
+        """Raise DrakeTeleopError, which names `caller`, if a leader arm commands joints."""
         if self.is_joint_leader:
             what = f"{caller} cannot use a leader arm that commands joints"
             remedy = "set it to pose; the rendered force is the same"

@@ -36,7 +36,7 @@ def _advance_device(
 
 
 def check_device_period(device: HapticDevice | LeaderDevice, q: Array, period: float) -> None:
-    """Raise a DrakeTeleopError if q is outside limits, or the step `period` [s] is too long."""
+    """Raise DrakeTeleopError if q is outside limits, or the step `period` [s] is too long."""
     if not 0 < period <= _MAX_SIMULATION_PERIOD_S:
         what = f"gives a period of {period:g} s (a simulated haptic device needs a positive one of"
         what = f"{what} at most {_MAX_SIMULATION_PERIOD_S:g} s)"
@@ -49,7 +49,7 @@ def check_device_period(device: HapticDevice | LeaderDevice, q: Array, period: f
         what = f"the friction stops the haptic device within {1e3 / rate:.2g} ms, so that its"
         what = f"{what} simulation with a period of {1e3 * period:g} ms is unstable"
         remedy = "choose less friction, or a higher rates.hand_hz"
-        raise DrakeTeleopError(what, where=device.friction_setting_path, remedy=remedy)
+        raise DrakeTeleopError(what, where=device.friction_setting_name, remedy=remedy)
 
 
 class MasterDevice(LeafSystem):
@@ -63,13 +63,13 @@ class MasterDevice(LeafSystem):
         input_ports:
         - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand on the stylus at E, in B [N, N m]
         - drive: (27,) from the force display: motor torques (6) [N m; N] (of a leader arm: the
-          wrench to display, [f; tau_z, tau_y, tau_x]), memory of the force display (21)
+          wrench to display, [f; tau_z, tau_y, tau_x]), next memory of the force display (21)
         output_ports:
         - state: (2 n,) [q; qdot] [rad, rad/s; prismatic axes m, m/s]
         - pose_master: (7,) X_BE of the stylus E in the device's base B
         - twist_master: (6,) [v; omega] of E in B [m/s, rad/s]
         - for_display: (27,) joint positions (6) [rad; m] (of a leader arm: position of E (3), three
-          unused zeros), memory of the force display
+          unused zeros), memory of the force display, which this block holds
     """
 
     __slots__ = NO_EXTRA_SLOTS

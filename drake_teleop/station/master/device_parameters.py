@@ -34,7 +34,7 @@ DEVICE_DTYPE = np.dtype(
 
 
 def pack_device_parameters(**values: ArrayLike) -> Records:
-    """Return keyword arguments as array (1,) of `DEVICE_DTYPE`; omitted fields are zero."""
+    """Return an array (1,) of `DEVICE_DTYPE` with fields from keywords, otherwise zero."""
     packed: Records = np.zeros(1, DEVICE_DTYPE)
     for name, value in values.items():
         packed[name] = value
@@ -43,7 +43,7 @@ def pack_device_parameters(**values: ArrayLike) -> Records:
 
 @njit(cache=True)
 def end_stop_force(x, rate, lower, upper, stiffness, damping):
-    """Return the force of an end stop that never pulls on coordinate `x`; 0 within the limits."""
+    """Return the force of an end stop at x with speed `rate`; it only pushes towards the limits."""
     if x > upper:
         return min(0.0, -stiffness * (x - upper) - damping * rate)
     if x < lower:

@@ -1,4 +1,4 @@
-"""Compiled dynamics of a haptic device with base frame B and stylus frame E."""
+"""Compiled dynamics of a haptic device, a `DEVICE_DTYPE` record; B: base frame, E: stylus frame."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def jacobian_into(q, device, J):
 
 @njit(cache=True)
 def gravity_compensation_torque_into(q, device, out):
-    """Write joint torques (6,) that cancel the device's weight into `out`; 0 in task space."""
+    """Write joint torques (6,) that cancel the weight into `out`; 0 for a `task_space` device."""
     if device.in_task_space:
         out[:6] = 0.0
     else:
@@ -53,7 +53,7 @@ def twist_into(q, v, device, J, twist):
 
 @njit(cache=True)
 def add_runge_kutta_stage(i, period, slope, total, stage, state):
-    """Add the slope of stage i (0 to 3) to `total`, write the next `stage`; 3 advances `state`."""
+    """Add `slope` of stage i to `total`; write the next `stage`, or after stage 3 `state`."""
     weight = 1.0 / 6.0 if i in (0, 3) else 1.0 / 3.0
     ahead = 1.0 if i == 2 else 0.5
     for k in range(state.shape[0]):
@@ -100,7 +100,7 @@ class HapticDevice:
         return self.packed_parameters[0]
 
     @property
-    def friction_setting_path(self) -> str:
+    def friction_setting_name(self) -> str:
         return "master.friction" if self.is_phantom else "master.figures"
 
     def coordinates_for_force_display(self, q: Array) -> Array:
@@ -108,7 +108,7 @@ class HapticDevice:
 
     @property
     def sliding_joints(self) -> tuple[int, ...]:
-        """Indices of the positions in m."""
+        """Indices of the prismatic joints."""
         return () if self.is_phantom else (0, 1, 2)
 
     @property
@@ -133,11 +133,11 @@ class HapticDevice:
         else:
             task_space.check_limits(q, self.parameters)
 
-    def is_any_axis_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
+    def flag_samples_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
         """Return flags (N,): True where an end stop acts at the row of q (N, 6)."""
         if self.is_phantom:
-            return phantom.is_any_axis_at_end_stop(q)
-        return task_space.is_any_axis_at_end_stop(q, self.parameters)
+            return phantom.flag_samples_at_end_stop(q)
+        return task_space.flag_samples_at_end_stop(q, self.parameters)
 
     def jacobian(self, q: Array) -> Array:
         J = np.empty((6, 6))
@@ -156,7 +156,7 @@ class HapticDevice:
     def damping_matrix(self, q: Array, include_coulomb_slope: bool = False) -> Array:
         """Return the damping matrix D (6, 6) of the joint forces -D dq/dt.
 
-        With `include_coulomb_slope`, D includes the slope of Coulomb friction over speed at rest.
+        `include_coulomb_slope` adds the derivative of Coulomb friction by speed, at rest.
         """
         if self.is_phantom:
             slope = self.parameters.dry_friction / phantom.FRICTION_TANH_SPEED_RAD_S

@@ -25,9 +25,7 @@ def encoder_pose_into(q, q_start, steps, packed_device, pose):
 
 
 class Encoders(LeafSystem):
-    """Encoders that round a device's joint positions to `steps` (6,) [m, rad]; 0: no rounding.
-
-    Steps count from the joint positions `q_start` (6,).
+    """Encoders that round joint positions to `steps` (6,) [m, rad] from `q_start` (6,); 0: exact.
 
     .. pydrake_system::
 

@@ -13,7 +13,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.master import dynamics
 from drake_teleop.station.master.device_parameters import DeviceParameters
-from drake_teleop.station.master.leader import LeaderDevice, limit_wrench_to_motor_torques
+from drake_teleop.station.master.leader import LeaderDevice, scale_wrench_to_motor_limits
 from drake_teleop.station.passivity import safe_state
 from drake_teleop.station.passivity.memory import SlotAllocator
 from drake_teleop.station.passivity.packet import limit_group
@@ -22,12 +22,12 @@ from drake_teleop.station.passivity.packet import limit_group
 # displayed wrench and fault, 1 if a fault changed the wrench, time since the last fault [s], memory
 # of `master_wrench_limits_into`. Vector to the device: motor torques in place of the positions, and
 # the new memory.
-_layout = SlotAllocator(6 + 6 + 7 + 1 + 1 + safe_state.MASTER_MONITOR_SIZE)
-_JOINT_POSITIONS_SLOTS, _LAST_VALID_POSITIONS_SLOTS = _layout.vector(6), _layout.vector(6)
-DISPLAYED_WRENCH_SLOTS, _FAULT_SLOT = _layout.vector(6), _layout.number()
-_IS_WRENCH_REDUCED_SLOT, _FAULT_AGE_SLOT = _layout.number(), _layout.number()
-_SAFE_STATE_MONITOR_SLOTS = _layout.vector(safe_state.MASTER_MONITOR_SIZE)
-_DISPLAYED_WRENCH_AND_FAULT_SLOTS = slice(DISPLAYED_WRENCH_SLOTS.start, _FAULT_SLOT + 1)
+_memory = SlotAllocator(6 + 6 + 7 + 1 + 1 + safe_state.MASTER_MONITOR_SIZE)
+_JOINT_POSITIONS_SLICE, _LAST_VALID_POSITIONS_SLICE = _memory.vector(6), _memory.vector(6)
+DISPLAYED_WRENCH_SLICE, _FAULT_INDEX = _memory.vector(6), _memory.number()
+_IS_WRENCH_REDUCED_INDEX, _FAULT_AGE_INDEX = _memory.number(), _memory.number()
+_SAFE_STATE_MONITOR_SLICE = _memory.vector(safe_state.MASTER_MONITOR_SIZE)
+_DISPLAYED_WRENCH_AND_FAULT_SLICE = slice(DISPLAYED_WRENCH_SLICE.start, _FAULT_INDEX + 1)
 _NO_FAULT, _WRENCH_FAULT, _HAND_FAULT, _RESUMING_FAULT = map(
     int, (Fault.NONE, Fault.HAND_WRENCH, Fault.HAND_JOINTS, Fault.RESUMING)
 )
@@ -39,10 +39,10 @@ def _peak_force_and_torque_of_device(parameters):
 
 
 def initial_display_state(q: Array, parameters: DeviceParameters) -> Array:
-    display = np.zeros(_SAFE_STATE_MONITOR_SLOTS.stop)
-    display[_JOINT_POSITIONS_SLOTS] = display[_LAST_VALID_POSITIONS_SLOTS] = q
+    display = np.zeros(_SAFE_STATE_MONITOR_SLICE.stop)
+    display[_JOINT_POSITIONS_SLICE] = display[_LAST_VALID_POSITIONS_SLICE] = q
     peaks = _peak_force_and_torque_of_device(parameters)
-    display[_SAFE_STATE_MONITOR_SLOTS] = safe_state.initial_master_monitor(peaks)
+    display[_SAFE_STATE_MONITOR_SLICE] = safe_state.initial_master_monitor(peaks)
     return display
 
 
@@ -83,53 +83,53 @@ def motor_torque_into(displayed, q, parameters, J, torque):
 def step_display(wrench, device, packed_parameters, period, J, drive):
     """Advance the force display by one `period` [s] for the wrench F_E_B (6,) to render.
 
-    `device` (27,) is output `for_display` of `MasterDevice`; its input `drive` (27,) is written.
+    `device` (27,) is the output `for_display` of the device block; `drive` (27,) its next input.
     """
     parameters = packed_parameters[0]
-    q, fault = device[_JOINT_POSITIONS_SLOTS], _NO_FAULT
-    copy_into(drive, 6, device, 6, _SAFE_STATE_MONITOR_SLOTS.stop - 6)
+    q, fault = device[_JOINT_POSITIONS_SLICE], _NO_FAULT
+    copy_into(drive, 6, device, 6, _SAFE_STATE_MONITOR_SLICE.stop - 6)
     if are_valid_port_values(q):
-        copy_into(drive, _LAST_VALID_POSITIONS_SLOTS.start, q, 0, 6)
+        copy_into(drive, _LAST_VALID_POSITIONS_SLICE.start, q, 0, 6)
     else:
-        q, fault = device[_LAST_VALID_POSITIONS_SLOTS], _HAND_FAULT
+        q, fault = device[_LAST_VALID_POSITIONS_SLICE], _HAND_FAULT
     if not are_valid_port_values(wrench):
         fault = _WRENCH_FAULT
-    displayed, drive[_FAULT_SLOT] = drive[DISPLAYED_WRENCH_SLOTS], fault
+    displayed, drive[_FAULT_INDEX] = drive[DISPLAYED_WRENCH_SLICE], fault
     dynamics.jacobian_into(q, parameters, J)
     limit_wrench_into(wrench, parameters, J, displayed)
-    if fault != _NO_FAULT or device[_IS_WRENCH_REDUCED_SLOT] != 0.0:
+    if fault != _NO_FAULT or device[_IS_WRENCH_REDUCED_INDEX] != 0.0:
         _fade_wrench_after_fault(device, parameters, period, drive)
     motor_torque_into(displayed, q, parameters, J, drive[:6])
 
 
 @njit(cache=True)
 def _fade_wrench_after_fault(device, parameters, period, drive):
-    displayed, last = drive[DISPLAYED_WRENCH_SLOTS], device[DISPLAYED_WRENCH_SLOTS]
+    displayed, last = drive[DISPLAYED_WRENCH_SLICE], device[DISPLAYED_WRENCH_SLICE]
     limits, device_limits = np.empty(2), _peak_force_and_torque_of_device(parameters)
-    fault = drive[_FAULT_SLOT] != _NO_FAULT
-    drive[_FAULT_AGE_SLOT] = 0.0 if fault else device[_FAULT_AGE_SLOT] + period
+    fault = drive[_FAULT_INDEX] != _NO_FAULT
+    drive[_FAULT_AGE_INDEX] = 0.0 if fault else device[_FAULT_AGE_INDEX] + period
     # Complete within STOP_TIME_S, so that the direction does not jump either.
-    left = safe_state.STOP_TIME_S + period - drive[_FAULT_AGE_SLOT]
+    left = safe_state.STOP_TIME_S + period - drive[_FAULT_AGE_INDEX]
     share = 0.0 if fault else period / max(left, period)
     for i in range(6):
         displayed[i] = (1.0 - share) * last[i] + share * displayed[i]
     safe_state.master_wrench_limits_into(
-        not fault, fault, period, 0.0, device_limits, last, drive[_SAFE_STATE_MONITOR_SLOTS], limits
+        not fault, fault, period, 0.0, device_limits, last, drive[_SAFE_STATE_MONITOR_SLICE], limits
     )
-    drive[_IS_WRENCH_REDUCED_SLOT] = 0.0
+    drive[_IS_WRENCH_REDUCED_INDEX] = 0.0
     for g in range(2):
         limit_group(displayed, g, limits[g])
         if limits[g] < device_limits[g]:
-            drive[_IS_WRENCH_REDUCED_SLOT] = 1.0
+            drive[_IS_WRENCH_REDUCED_INDEX] = 1.0
     if not fault:
-        drive[_FAULT_SLOT] = _RESUMING_FAULT
+        drive[_FAULT_INDEX] = _RESUMING_FAULT
 
 
 class ForceDisplay(LeafSystem):
     """Block that converts the wrench to render into motor torques of the master.
 
-    While inputs are invalid, the displayed wrench fades to zero in 50 ms; valid again, it ramps up.
-    For a leader arm, it is scaled so that motors that also compensate weight stay within limits.
+    While an input is invalid, the displayed wrench fades to zero in 50 ms, and then ramps up. For a
+    leader arm, the wrench is scaled so that motors, with weight compensation, stay within limits.
 
     .. pydrake_system::
 
@@ -153,14 +153,14 @@ class ForceDisplay(LeafSystem):
         self._jacobian, self._limited = np.zeros((6, 6)), np.zeros(6)
         self._num_joints = device.num_joints
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
-        self._device = self.DeclareVectorInputPort("for_display", _SAFE_STATE_MONITOR_SLOTS.stop)
+        self._device = self.DeclareVectorInputPort("for_display", _SAFE_STATE_MONITOR_SLICE.stop)
         self._leader = device.compiled_constants if isinstance(device, LeaderDevice) else None
         dynamics.jacobian_into(np.zeros(6), device.parameters, self._jacobian)  # of a leader arm
         if self._leader is not None:
             self._state = self.DeclareVectorInputPort("state", 2 * device.num_joints)
         inputs = {self.all_input_ports_ticket()}
         self._drive = self.DeclareVectorOutputPort(
-            "drive", _SAFE_STATE_MONITOR_SLOTS.stop, weak_callback(self._calc_drive), inputs
+            "drive", _SAFE_STATE_MONITOR_SLICE.stop, weak_callback(self._calc_drive), inputs
         )
         # The log samples with the device, so the drive is calculated once.
         for name, size, calc in (
@@ -177,16 +177,16 @@ class ForceDisplay(LeafSystem):
             if np.isfinite(wrench).all() and np.isfinite(q).all():
                 limits = self._parameters[0], self._jacobian, self._limited
                 limit_wrench_into(wrench, *limits)  # first: undisplayed torque needs no motor
-                limit_wrench_to_motor_torques(self._leader, q, self._limited, self._limited)
+                scale_wrench_to_motor_limits(self._leader, q, self._limited, self._limited)
                 wrench = self._limited
         constants = self._parameters, self._period, self._jacobian
         step_display(wrench, self._device.Eval(context), *constants, output.get_mutable_value())
 
     def _calc_displayed_wrench(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._drive.Eval(context)[DISPLAYED_WRENCH_SLOTS])
+        output.SetFromVector(self._drive.Eval(context)[DISPLAYED_WRENCH_SLICE])
 
     def _calc_fault_code(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._drive.Eval(context)[_FAULT_SLOT]
+        output[0] = self._drive.Eval(context)[_FAULT_INDEX]
 
     def _calc_displayed_wrench_and_fault(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._drive.Eval(context)[_DISPLAYED_WRENCH_AND_FAULT_SLOTS])
+        output.SetFromVector(self._drive.Eval(context)[_DISPLAYED_WRENCH_AND_FAULT_SLICE])

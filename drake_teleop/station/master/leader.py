@@ -34,16 +34,16 @@ from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 _COULOMB_ROW, _DAMPING_ROW, _MIN_Q_ROW, _MAX_Q_ROW, _STOP_STIFFNESS_ROW = range(5)
 _STOP_DAMPING_ROW, _TORQUE_LIMIT_ROW, _CARRIED_WEIGHT_SHARE_ROW = range(5, 8)
 # Coulomb friction is proportional to the tanh of speed over this one: a slower joint creeps.
-LEADER_FRICTION_TANH_SPEED_RAD_OR_M_S = 0.02  # rad/s or m/s, estimate
+LEADER_FRICTION_TANH_SPEED_SI = 0.02  # rad/s or m/s, estimate
 # Natural frequency of the critically damped end stops with the joint's inertia, estimate.
 _END_STOP_NATURAL_FREQUENCY_HZ = 12.0
 
 
 @njit(cache=True)
 def leader_acceleration_into(arm, joint_table, q, v, hand_wrench_minus_weight, motor, vdot):
-    """Write the joint accelerations (n,) [rad/s^2] of leader and hand into `vdot`.
+    """Write joint accelerations (n,) [rad/s^2] of leader and hand, for motor torques, into `vdot`.
 
-    `hand_wrench_minus_weight` (6,) is [f; tau] of the hand on E, in B, minus the hand's weight.
+    `hand_wrench_minus_weight` (6,) is [f; tau] of the hand on E, in B, without its weight.
     """
     n = q.shape[0]
     R_BE, p_BE, tau, wrench = np.empty((3, 3)), np.empty(3), np.empty(n), np.empty(6)
@@ -52,7 +52,7 @@ def leader_acceleration_into(arm, joint_table, q, v, hand_wrench_minus_weight, m
     add_vector_into(wrench, 3, cross(vector_at(p_BE, 0), vector_at(wrench, 0)))
     for i in range(n):
         tau[i] = motor[i] - joint_table[_COULOMB_ROW, i] * math.tanh(
-            v[i] / LEADER_FRICTION_TANH_SPEED_RAD_OR_M_S
+            v[i] / LEADER_FRICTION_TANH_SPEED_SI
         )
         tau[i] -= joint_table[_DAMPING_ROW, i] * v[i]
         lower, upper, stiffness, damping = joint_table[_MIN_Q_ROW : _STOP_DAMPING_ROW + 1, i]
@@ -101,7 +101,8 @@ def limited_leader_motor_torques_into(leader, q, F, torque):
 def step_leader(leader, weight, state, pose, twist, display, hand_wrench, drive, period):
     """Advance `state` (2 n,) by one Runge-Kutta step of `period` [s]; update pose and twist.
 
-    `leader` is `LeaderDevice.compiled_constants`. The operator carries the hand's `weight` [N].
+    `leader` is `LeaderDevice.compiled_constants`, `weight` [N] the hand's, which the operator
+    carries, `display` and `drive` (27,) as in `MasterDevice`, `hand_wrench` (6,) at E, in B.
     """
     _, arm, joint_table = leader
     n = joint_table.shape[1]
@@ -131,8 +132,8 @@ def step_leader(leader, weight, state, pose, twist, display, hand_wrench, drive,
 
 
 @njit(cache=True)
-def limit_wrench_to_motor_torques(leader, q, wrench, limited):
-    """Write `wrench` (6,) to `limited`, scaled so that motors also carry weight within limits."""
+def scale_wrench_to_motor_limits(leader, q, wrench, limited):
+    """Write `wrench` (6,) to `limited`, scaled so that motors with weight keep their limits."""
     _, arm, joint_table = leader
     n = q.shape[0]
     weight, J, share = np.empty(n), np.empty((6, n)), 1.0
@@ -150,7 +151,7 @@ def limit_wrench_to_motor_torques(leader, q, wrench, limited):
 
 
 @njit(cache=True)
-def _flag_samples_with_motor_at_limit(leader, q, F, torque_share):
+def _flag_samples_at_motor_limit(leader, q, F, torque_share):
     rows, n = q.shape
     flags, torque = np.zeros(rows, np.bool_), np.empty(n)
     for row in range(rows):
@@ -168,9 +169,9 @@ class LeaderDevice:
         arm: dynamics of the chain from B to E, with the hand's mass.
         arm_without_hand: dynamics without the hand, for weight compensation.
         joint_table: (8, n) rows: Coulomb friction [N m], damping in addition to the model's
-            [N m s/rad], lower and upper limits [rad], stiffness and damping of end stops, torque
-            limits [N m], share of the weight that the motors compensate.
-        home: (n,) joint positions where E has the axes of B [rad].
+            [N m s/rad], lower and upper limits [rad], stiffness [N m/rad], damping [N m s/rad] of
+            end stops, torque limits [N m], compensated share of the weight.
+        home: (n,) joint positions [rad] at which E is parallel to B.
         packed_parameters: parameters for the force display, in an array (1,).
     """
 
@@ -182,7 +183,7 @@ class LeaderDevice:
     name: str = "leader"
     is_phantom = False
     #: Scenario field of the friction.
-    friction_setting_path = "master.leader"
+    friction_setting_name = "master.leader"
 
     @property
     def parameters(self) -> DeviceParameters:
@@ -204,7 +205,7 @@ class LeaderDevice:
 
     @property
     def compiled_constants(self) -> tuple[Array, Array, Array]:
-        """`ArmModel.table` without the hand and with the hand; `joint_table`."""
+        """Arm tables without and with the hand, and `joint_table`."""
         return self.arm_without_hand.table, self.arm.table, self.joint_table
 
     def coordinates_for_force_display(self, q: Array) -> Array:
@@ -237,15 +238,15 @@ class LeaderDevice:
             remedy = "choose leader.home and master.position within the joint limits"
             raise DrakeTeleopError(what, where="master.leader.home", remedy=remedy)
 
-    def is_any_motor_at_limit(self, q: Array, F: Array, share: float) -> NDArray[np.bool_]:
-        """Return flags (N,): True if a motor's torque is at least `share` of its limit.
+    def flag_samples_at_motor_limit(self, q: Array, F: Array, share: float) -> NDArray[np.bool_]:
+        """Return flags (N,): a motor's torque is at least `share` of its limit.
 
         The motors compensate the weight at joint positions q (N, n) and display F (N, 6) at E.
         """
         constants = self.compiled_constants
-        return np.asarray(_flag_samples_with_motor_at_limit(constants, q.copy(), F.copy(), share))
+        return np.asarray(_flag_samples_at_motor_limit(constants, q.copy(), F.copy(), share))
 
-    def is_any_axis_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
+    def flag_samples_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
         return ((q < self.joint_table[_MIN_Q_ROW]) | (q > self.joint_table[_MAX_Q_ROW])).any(axis=1)
 
     def jacobian(self, q: Array) -> Array:
@@ -258,17 +259,17 @@ class LeaderDevice:
 
     def damping_matrix(self, q: Array, include_coulomb_slope: bool = False) -> Array:
         own = self.joint_table[_DAMPING_ROW] + self.arm.table[:-1, serial_arm.DAMPING_COLUMN]
-        slope = self.joint_table[_COULOMB_ROW] / LEADER_FRICTION_TANH_SPEED_RAD_OR_M_S
+        slope = self.joint_table[_COULOMB_ROW] / LEADER_FRICTION_TANH_SPEED_SI
         return np.diag(own + include_coulomb_slope * slope)
 
 
 def make_leader_joint_table(
     arm: ArmModel, home: Array, coulomb: Array, viscous: Array, limit: Array, weight_share: float
 ) -> Array:
-    """Return `LeaderDevice.joint_table` (8, n); the end stops scale with the inertia at home.
+    """Return `LeaderDevice.joint_table` (8, n); end stops have 12 Hz with the inertia at home.
 
-    `coulomb` and `limit` are friction and torque limit [N m], `viscous` the damping in addition to
-    the model's [N m s/rad], each (n,); `weight_share` is the compensated share of the weight.
+    `coulomb` and `limit` (n,) are friction and torque limit [N m], `viscous` (n,) further damping
+    [N m s/rad], `weight_share` the compensated share of the weight.
     """
     inertia, w = np.diag(mass_matrix(arm, home)), 2 * np.pi * _END_STOP_NATURAL_FREQUENCY_HZ
     rows = [coulomb, viscous, arm.lower, arm.upper, w**2 * inertia, 2 * w * inertia, limit]

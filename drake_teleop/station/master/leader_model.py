@@ -26,33 +26,33 @@ LEADER_JOINT_MODE = "joints"
 @settings
 @dataclass
 class Leader:
-    """Settings of a leader arm, whose base is placed so that E is at `master.position` at home."""
+    """Settings of a leader arm; its base is placed so that E is at `master.position` at home."""
 
-    file: str = plain("", "URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder", is_path=True)
+    file: str = plain("", "URDF, SDF, MJCF or .dmd.yaml in the scenario's folder", is_path=True)
     package_paths: list[str] = plain(
-        [], "folders for package:// addresses in file, from the scenario's folder", is_path=True
+        [], "folders of package:// in the file, relative to the scenario's folder", is_path=True
     )
     hand_frame: str = plain("", "name of the frame or link at the grip")
-    home: list[float] = quantity([], "rad, m", -1e4, 1e4, "start posture; default: 0 or mid-range")
+    home: list[float] = quantity([], "rad, m", -1e4, 1e4, "start; default: 0, if outside: middle")
     base_rotation: list[float] = quantity(
-        [0.0, 0.0, 0.0], "rad", -2 * math.pi, 2 * math.pi, "R_BBase: roll, pitch, yaw; B's z is up"
+        [0.0, 0.0, 0.0], "rad", -2 * math.pi, 2 * math.pi, "arm base in B (z up): roll, pitch, yaw"
     )
-    weight_carried: float = quantity(1.0, "1", 0.0, 1.0, "compensated share of the arm's weight")
+    weight_carried: float = quantity(1.0, "1", 0.0, 1.0, "share of arm weight that motors carry")
     friction: list[float] = quantity(
-        [], "N m", 0.0, 1e6, "Coulomb friction of the joints, one for all or each; by default none"
+        [], "N m", 0.0, 1e6, "Coulomb friction, one for all joints or one each; default: none"
     )
     damping: list[float] = quantity(
-        [], "N m s/rad", 0.0, 1e6, "damping in addition to the model's, one for all or each joint"
+        [], "N m s/rad", 0.0, 1e6, "damping added to the model's, one for all joints or one each"
     )
     torque_limit: list[float] = quantity(
-        [], "N m", 0.0, 1e6, "motor torque limits, one for all or each; default: the model's"
+        [], "N m", 0.0, 1e6, "motor limits, one for all joints or one each; default: model's"
     )
     peak_force: float = quantity(30.0, "N", 0.0, 500.0, "largest displayed force")
     peak_torque: float = quantity(3.0, "N m", 0.0, 50.0, "largest displayed torque about each axis")
     leads: str = choice(
         "pose",
         ("pose", LEADER_JOINT_MODE),
-        "pose: hand commands X_WS; joints: each joint commands the slave's same joint",
+        "pose: the hand commands X_WS; joints: joint k commands the slave's joint k",
     )
 
     def check(self, where: str) -> None:
@@ -80,7 +80,7 @@ class Leader:
         frame = parsed.sensor_frame
         arm = ArmModelFromPlant(plant, frame.model_instance(), frame.name())
         home = self._home_joint_positions(arm)
-        arm_without_hand = _with_end_frame_E_placed_at_home(arm, home, np.array(position))
+        arm_without_hand = _place_end_frame_E_at_home(arm, home, np.array(position))
         phi = arm_without_hand.phi_load
         phi[0] += hand_mass
         phi[[4, 7, 9]] += hand_inertia
@@ -106,7 +106,7 @@ class Leader:
         return np.where(within, 0.0, arm.middle_positions)
 
 
-def _with_end_frame_E_placed_at_home(arm: ArmModel, home: Array, p_BE: Array) -> ArmModel:
+def _place_end_frame_E_at_home(arm: ArmModel, home: Array, p_BE: Array) -> ArmModel:
     # The base moves so that E is at p_BE (3,) at home.
     R, p = np.empty((3, 3)), np.empty(3)
     serial_arm.forward_kinematics(arm.table, home, R, p)

@@ -7,7 +7,7 @@ downward vertical towards x_B (absolute); wrist yaw, pitch, roll.
     p_BE = Rz(q1) [l1 cos q2 + l2 sin q3, 0, l1 sin q2 - l2 cos q3]
     R_BE = Rz(q1) Ry(-q3) Rz(q4) Ry(q5) Rx(q6), singular at q5 = +-90 degrees
 
-Sources in comments: P: Cavusoglu, Feygin, Tendick 2002, as in mahilab/Phantom; D: manufacturer.
+Comments name sources: P: Cavusoglu, Feygin, Tendick 2002, from mahilab/Phantom; D: manufacturer.
 """
 
 from __future__ import annotations
@@ -63,9 +63,9 @@ _LINK_2_STEINER_KG_M2, _LINK_3_STEINER_KG_M2 = L2**2 * MASS_A / 4, L3**2 * MASS_
 # Terms of M11: constant, times cos 2 q2, times cos 2 q3, 2 _M23_MAX_KG_M2 times cos q2 sin q3.
 _a, _be = SEGMENT_A_INERTIA_KG_M2, SEGMENT_BE_INERTIA_KG_M2
 _c, _df = SEGMENT_C_INERTIA_KG_M2, SEGMENT_DF_INERTIA_KG_M2
-_m11_constants = sum(sum(inertia[1:]) for inertia in (_a, _be, _c, _df)) + _LINK_1_STEINER_KG_M2
-_m11_constants = _m11_constants + _LINK_2_STEINER_KG_M2 + _LINK_3_STEINER_KG_M2
-_M11_CONSTANT_TERM_KG_M2 = BASE_INERTIA_YY_KG_M2 + 0.5 * _m11_constants
+_yy_zz_sum_kg_m2 = sum(sum(inertia[1:]) for inertia in (_a, _be, _c, _df)) + _LINK_1_STEINER_KG_M2
+_yy_zz_sum_kg_m2 = _yy_zz_sum_kg_m2 + _LINK_2_STEINER_KG_M2 + _LINK_3_STEINER_KG_M2
+_M11_CONSTANT_TERM_KG_M2 = BASE_INERTIA_YY_KG_M2 + 0.5 * _yy_zz_sum_kg_m2
 _M11_COS_2Q2_KG_M2 = 0.5 * (_be[1] - _be[2] + _c[1] - _c[2] + _LINK_1_STEINER_KG_M2)
 _M11_COS_2Q3_KG_M2 = 0.5 * (_a[1] - _a[2] + _df[1] - _df[2] - _LINK_2_STEINER_KG_M2)
 _M11_COS_2Q3_KG_M2 -= 0.5 * _LINK_3_STEINER_KG_M2
@@ -73,12 +73,12 @@ _M23_MAX_KG_M2 = 0.5 * L1 * (L2 * MASS_A + L3 * MASS_C)
 _M22_KG_M2 = _be[0] + _c[0] + _LINK_1_STEINER_KG_M2
 _M33_KG_M2 = _a[0] + _df[0] + _LINK_2_STEINER_KG_M2 + _LINK_3_STEINER_KG_M2
 _REFLECTED_MOTOR_INERTIAS_KG_M2 = tuple(gear**2 * MOTOR_INERTIA_KG_M2 for gear in GEAR_RATIOS)
-_GRAVITY_TORQUE_2_N_M = 0.5 * GRAVITY_M_S2 * (2 * L1 * MASS_A + 2 * L5 * MASS_BE + L1 * MASS_C)
-_GRAVITY_TORQUE_3_N_M = 0.5 * GRAVITY_M_S2 * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6 * MASS_DF)
+_JOINT_2_GRAVITY_N_M = 0.5 * GRAVITY_M_S2 * (2 * L1 * MASS_A + 2 * L5 * MASS_BE + L1 * MASS_C)
+_JOINT_3_GRAVITY_N_M = 0.5 * GRAVITY_M_S2 * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6 * MASS_DF)
 
 
 @njit(cache=True)
-def _main_axes_mass_matrix_into(q, M):
+def _mass_matrix_of_joints_1_to_3_into(q, M):
     M[:, :] = 0.0
     M[0, 0] = _M11_CONSTANT_TERM_KG_M2 + _M11_COS_2Q2_KG_M2 * math.cos(2.0 * q[1])
     M[0, 0] += _M11_COS_2Q3_KG_M2 * math.cos(2.0 * q[2])
@@ -111,8 +111,8 @@ def jacobian_into(q, J):
 
 @njit(cache=True)
 def joint_mass_matrix_into(q, J, hand_mass, hand_inertia, M):
-    """Write the mass matrix (6, 6) with wrist, hand and motors into M; J (6, 6) is the Jacobian."""
-    _main_axes_mass_matrix_into(q, M)
+    """Write the mass matrix (6, 6) with wrist, hand (inertia about each axis) and motors into M."""
+    _mass_matrix_of_joints_1_to_3_into(q, M)
     for i in range(3):
         M[i, i] += _REFLECTED_MOTOR_INERTIAS_KG_M2[i]
     tip_mass = WRIST_MASS_KG + hand_mass
@@ -131,8 +131,8 @@ def joint_mass_matrix_into(q, J, hand_mass, hand_inertia, M):
 def gravity_compensation_torque_into(q, out):
     weight = WRIST_MASS_KG * GRAVITY_M_S2
     out[0] = 0.0
-    out[1] = (_GRAVITY_TORQUE_2_N_M + weight * L1) * math.cos(q[1])
-    out[2] = (_GRAVITY_TORQUE_3_N_M + weight * L2) * math.sin(q[2])
+    out[1] = (_JOINT_2_GRAVITY_N_M + weight * L1) * math.cos(q[1])
+    out[2] = (_JOINT_3_GRAVITY_N_M + weight * L2) * math.sin(q[2])
     out[3:6] = 0.0
 
 
@@ -247,13 +247,13 @@ def inverse_kinematics(pose: Array) -> Array:
 
 
 def serial_joint_angles(q: Array) -> Array:
-    """Return q (..., 6) as joint angles of the serial model `phantom.sdf`: the third is q3 - q2."""
+    """Return q (..., 6) as joint angles of `phantom.sdf`, whose third one is q3 - q2."""
     serial = np.array(q, dtype=float)
     serial[..., 2] -= serial[..., 1]
     return serial
 
 
-def is_any_axis_at_end_stop(q: Array) -> NDArray[np.bool_]:
+def flag_samples_at_end_stop(q: Array) -> NDArray[np.bool_]:
     folded = q[:, 1] - q[:, 2]
     beyond = ((q < JOINT_LOWER_RAD) | (q > JOINT_UPPER_RAD)).any(axis=1)
     return beyond | (folded < Q2_MINUS_Q3_RANGE_RAD[0]) | (folded > Q2_MINUS_Q3_RANGE_RAD[1])

@@ -47,7 +47,7 @@ def joint_mass_matrix_into(J, device, M):
 
 
 @njit(cache=True)
-def _friction_force_per_speed(velocity, coulomb, viscous, tanh_speed):
+def _friction_force_to_speed_ratio(velocity, coulomb, viscous, tanh_speed):
     speed = math.hypot(math.hypot(velocity[0], velocity[1]), velocity[2])
     if speed < 1e-9 * tanh_speed:  # tanh(x) = x, without 0 / 0
         return viscous + coulomb / tanh_speed
@@ -59,7 +59,7 @@ def joint_acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
     J = work[0]
     jacobian_into(q, J)
     mass = device.mass + device.hand_mass
-    drag = _friction_force_per_speed(
+    drag = _friction_force_to_speed_ratio(
         v[:3], device.dry_friction[0], device.damping[0], FRICTION_TANH_SPEED_M_S
     )
     for i in range(3):
@@ -74,7 +74,7 @@ def joint_acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
         turn = scale_vector(v[k], (J[3, k], J[4, k], J[5, k]))
         bias = plus(bias, cross(omega, turn))
         omega = plus(omega, turn)
-    drag = _friction_force_per_speed(
+    drag = _friction_force_to_speed_ratio(
         omega, device.dry_friction[3], device.damping[3], FRICTION_TANH_SPEED_RAD_S
     )
     # Joint torques of motors and stops, then of moments about B's axes.
@@ -128,7 +128,7 @@ def _are_axes_past_end_stop(q: Array, device: DeviceParameters, margin: float) -
     return np.abs(q - centre) > half + margin
 
 
-def is_any_axis_at_end_stop(q: Array, device: DeviceParameters) -> NDArray[np.bool_]:
+def flag_samples_at_end_stop(q: Array, device: DeviceParameters) -> NDArray[np.bool_]:
     has_end_stop = np.append([True] * 3, device.max_rotation > 0.0)
     return (_are_axes_past_end_stop(q, device, 0.0) & has_end_stop).any(axis=1)
 

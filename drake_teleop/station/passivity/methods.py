@@ -104,7 +104,7 @@ METHODS = Registry(
 )
 """All methods by name."""
 
-_DEFAULT_SLAVE_MASS_AND_INERTIA = [15.13, 0.5]  # kg, kg m^2 (E)
+_DEFAULT_SLAVE_MASS_AND_INERTIA = [15.13, 0.5]  # kg, kg m^2, estimate
 
 
 @settings
@@ -128,16 +128,16 @@ class PassivityConfig:
         "hand speed along the wrench from which the wrench fades, to zero at twice the speed",
     )  # fmt: skip
     servo_stiffness: list[float] = quantity(
-        [2.1e5, 6.8e3], "N/m, N m/rad", 1.0, 1e9, "K of the slave's servo, in the slave's units (E)"
+        [2.1e5, 6.8e3], "N/m, N m/rad", 1.0, 1e9, "K of the slave's servo, in its units (estimate)"
     )
     servo_damping: list[float] = quantity(
         [3.5e3, 117.0], "N s/m, N m s/rad", 0.0, 1e8,
-        "D of the slave's servo, in the slave's units (E)",
+        "D of the slave's servo, in its units (estimate)",
     )  # fmt: skip
     slave_mass: list[float] | None = quantity(
         None, "kg, kg m^2", 1e-6, 1e6,
         "mass of arm and tool at the tool, in the slave's units; null: with ledger, mass and servo"
-        " of the station's arm at the start; else 15.13, 0.5 (E)", length=2,
+        " of the station's arm at the start; else 15.13, 0.5 (estimate)", length=2,
     )  # fmt: skip
     registered: dict[str, float] = plain({}, "parameters of a registered method, by name")
     wave: WaveConfig = field(default_factory=WaveConfig)

@@ -51,11 +51,11 @@ from drake_teleop.station.slave.plant_dynamics import (
     PROXIMITY_TOUCHING,
     ContactPlantCopy,
     assemble_plant_state_into,
+    classify_tool_proximity,
     contact_and_plant_rates_into,
     contact_wrench_W,
     environment_wrench_about_Wo_into,
     plant_rates_under_wrench_into,
-    tool_proximity,
 )
 from drake_teleop.station.wiring import connect_matching_inputs
 
@@ -271,7 +271,7 @@ class WristSensor(LeafSystem):
         motion_constants, estimator = motion_estimation.initialize_motion_estimator(
             motion, config, n, period
         )
-        self._physics, contact = slave.physics_of_plant, slave.contact
+        self._physics, contact = slave.compiled_constants, slave.contact
         #: Offset (6,) of force and torque [N, N m] and inertial parameters (10,) of the tool; both
         #: are views that may be changed during a run.
         self.offset, self.phi = constants["offset"][0, :6], self._physics[1]
@@ -284,7 +284,7 @@ class WristSensor(LeafSystem):
         # The plant's contact wrench costs as much as two samples; noise exceeds its gain by 1e9.
         self._uses_plant_contact = config.ideal or bool(contact.drake_contact_reason)
         # Contact needs many steps per torque sample, so queueing them saves time.
-        queues = slave.can_touch and not contact.drake_contact_reason
+        queues = slave.can_tool_touch and not contact.drake_contact_reason
         self._max_queued_steps = _MAX_QUEUED_PLANT_STEPS if queues else 1
         self._around = np.zeros(2 + contact.plant_state_size)
         tail = np.zeros(2 + self._max_queued_steps * (2 * n + 1 + len(self._around)))
@@ -310,11 +310,11 @@ class WristSensor(LeafSystem):
         self._acceleration = self.DeclareVectorInputPort("slave_acceleration", n)
         self._applied = self.DeclareVectorInputPort("applied_wrench_W", 6)
         self._sheet = self._contacts = self._noise = self._plant = None
-        if slave.compiled_sheet_instance is not None:
+        if slave.leaf_instance_in_compiled_law is not None:
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
         if contact.plant_state_size:
             self._plant = self.DeclareVectorInputPort("plant_state", contact.plant_state_size)
-        if slave.can_touch:
+        if slave.can_tool_touch:
             contacts = Value[ContactResults]()
             self._contacts = self.DeclareAbstractInputPort("contact_results", contacts)
             self._tool = contact.tool_bodies, contact.tool_shapes
@@ -376,7 +376,7 @@ class WristSensor(LeafSystem):
             return PROXIMITY_TOUCHING
         arm, _, pairs, _, joints, _ = self._physics
         q, sheet, plant = state[: self._n], surroundings[:2], surroundings[2:]
-        return tool_proximity(arm, pairs, self._monitored_pairs, joints, q, sheet, plant)
+        return classify_tool_proximity(arm, pairs, self._monitored_pairs, joints, q, sheet, plant)
 
     def _plant_contact_wrench_W(self, context: Context) -> Array:
         assert self._contacts is not None

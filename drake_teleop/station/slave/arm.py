@@ -35,8 +35,8 @@ from drake_teleop.common.vectors import (
 # Columns of ArmModel.table.
 ROTATION_COLUMN, TRANSLATION_COLUMN, PHI_COLUMN, ROTOR_COLUMN = 0, 9, 12, 22
 DAMPING_COLUMN, DRY_FRICTION_COLUMN, IS_PRISMATIC_COLUMN = 23, 24, 25
-NUM_TABLE_COLUMNS = 26
-ARM_FRICTION_TANH_SPEED_RAD_OR_M_S = 2e-3
+NUM_ARM_TABLE_COLUMNS = 26
+ARM_FRICTION_TANH_SPEED_SI = 2e-3
 """Speed v_0 of the dry friction tau = -tau_C tanh(v / v_0) [rad/s, m/s], estimate."""
 LAST_ROW_GRAVITY_COLUMN = 22  # first of three columns with gravity, in the last row only
 
@@ -58,8 +58,8 @@ class ArmModel:
         table: (n+1, 26), a row for each joint and a last row for S, fixed to L_n. Columns: 0-8
             R_PJ by rows, with the previous link's frame P; 9-11 p_PJ [m]; 12-21 phi of the link, in
             L_j (last row: of the load, in S); 22 rotor inertia at the joint [kg m^2]; 23 damping
-            [N m s/rad]; 24 dry friction [N m]; 25 is 1 for a prismatic joint. Last row, 22-24:
-            gravity in W [m/s^2].
+            [N m s/rad]; 24 dry friction [N m]; 25 is 1 for a prismatic joint. In the last row,
+            22-24 are gravity in W [m/s^2].
         lower, upper: (n,) joint limits [rad], -inf and inf for joints without limits.
         velocity_limit, acceleration_limit, effort_limit: (n,) [rad/s, rad/s^2, N m] or inf.
         position_index, velocity_index: (n,) indices in the plant's positions and velocities.
@@ -117,7 +117,7 @@ class ArmModel:
 def _propagate_pose_to_child_link(
     table: Array, row: int, q: float, x: Array
 ) -> tuple[float, float, float]:
-    """Advance the pose in the state x from link P to the next link L; return p_PL_W."""
+    """Replace the pose of link P in x by that of the next link L; return p_PL_W [m]."""
     joint = table[row]
     p_PL_P = vector_at(joint, TRANSLATION_COLUMN)
     if joint[IS_PRISMATIC_COLUMN] != 0.0:
@@ -166,7 +166,7 @@ def acceleration_from_specific_force_into(table: Array, q: Array, s: Array, out:
 
 
 @njit(cache=True, inline="always")
-def _write_base_motion_with_minus_gravity(table: Array, x: Array) -> None:
+def _start_motion_at_rest_with_minus_gravity(table: Array, x: Array) -> None:
     x[:] = 0.0
     for k in range(3):
         x[k] = -table[table.shape[0] - 1, LAST_ROW_GRAVITY_COLUMN + k]
@@ -217,9 +217,9 @@ def jacobian_and_pose(table: Array, q: Array, J_out: Array, x: Array) -> None:
 
 @njit(cache=True)
 def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
-    """Write the motion of S to out (21,): s, omega_WS, alpha_WS in S, then p_WS, R_WS by rows."""
+    """Write the motion x of S to out (21,), but with s, omega, alpha in S instead of W."""
     n = table.shape[0] - 1
-    _write_base_motion_with_minus_gravity(table, out)
+    _start_motion_at_rest_with_minus_gravity(table, out)
     for row in range(n + 1):
         qi, vi, ai = (q[row], v[row], vdot[row]) if row < n else (0.0, 0.0, 0.0)
         _propagate_motion_to_child_link(table, row, qi, vi, ai, out)
@@ -230,9 +230,9 @@ def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> 
 
 @njit(cache=True)
 def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
-    """Write the states [s, omega, alpha, p_WL, R_WL] in W of all links and S to out (n+1, 21)."""
+    """Write the states x of all links and of S to out (n+1, 21)."""
     n = table.shape[0] - 1
-    _write_base_motion_with_minus_gravity(table, out[0])
+    _start_motion_at_rest_with_minus_gravity(table, out[0])
     for row in range(n + 1):
         if row > 0:
             out[row] = out[row - 1]
@@ -242,7 +242,7 @@ def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> N
 
 @njit(cache=True, inline="always")
 def _write_joint_axis_and_inertial_wrench(table: Array, row: int, x: Array, link: Array) -> None:
-    """Write [z_L, p_WL, f, tau] in W to `link[row]`; link motion x requires f, and tau about Wo."""
+    """Write [z_L, p_WL, f, tau] in W to `link[row]`; the motion x needs force f, tau about Wo."""
     phi, wrench, R_WL, p_WL = table[row, PHI_COLUMN:], link[row], matrix_at(x, 12), vector_at(x, 9)
     R_LW, m, h, inertia = transposed(R_WL), phi[0], vector_at(phi, 1), symmetric_matrix_at(phi, 4)
     s, omega = apply_matrix(R_LW, vector_at(x, 0)), apply_matrix(R_LW, vector_at(x, 3))
@@ -284,7 +284,7 @@ def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Arr
     n = table.shape[0] - 1
     x = np.empty(21)
     link = np.empty((n + 1, 12))
-    _write_base_motion_with_minus_gravity(table, x)
+    _start_motion_at_rest_with_minus_gravity(table, x)
     for row in range(n + 1):
         qi, vi, ai = (q[row], v[row], vdot[row]) if row < n else (0.0, 0.0, 0.0)
         _propagate_motion_to_child_link(table, row, qi, vi, ai, x)
@@ -323,7 +323,7 @@ def _add_link_inertia_about_world(table: Array, row: int, x: Array, inertia: Arr
 
 @njit(cache=True)
 def _lower_mass_matrix_into(table: Array, link: Array, inertia: Array, M: Array) -> None:
-    """Write the lower half of the mass matrix to M (n, n); overwrite `link` and `inertia`."""
+    """Write the lower half of the mass matrix to M (n, n); inputs `link`, `inertia` change."""
     # Composite rigid bodies: Featherstone, Rigid Body Dynamics Algorithms (2008), section 6.2.
     n = M.shape[0]
     for row in range(n):
@@ -353,7 +353,7 @@ def _lower_mass_matrix_into(table: Array, link: Array, inertia: Array, M: Array)
 @njit(cache=True)
 def dry_friction(coulomb: float, speed: float) -> float:
     """Return the dry friction torque [N m], opposite to the speed [rad/s] and at most `coulomb`."""
-    return -coulomb * np.tanh(speed / ARM_FRICTION_TANH_SPEED_RAD_OR_M_S)
+    return -coulomb * np.tanh(speed / ARM_FRICTION_TANH_SPEED_SI)
 
 
 @njit(cache=True)
@@ -363,14 +363,14 @@ def forward_dynamics(
     """Write joint accelerations vdot, from M(q) vdot = tau + tau_friction(v) + J^T F - h(q, v).
 
     tau_friction is joint damping and dry friction; h is the torque of gravity, Coriolis and
-    centrifugal effects. F is the wrench `wrench_W` on the load, about the world's origin [N, N m].
+    centrifugal effects; F, J: wrench `wrench_W` on the load and Jacobian about Wo [N, N m].
     """
     n = table.shape[0] - 1
     x = np.empty(21)
     link = np.empty((n + 1, 12))
     inertia = np.zeros((n + 1, 10))
     M = np.empty((n, n))
-    _write_base_motion_with_minus_gravity(table, x)
+    _start_motion_at_rest_with_minus_gravity(table, x)
     for row in range(n + 1):
         qi, vi = (q[row], v[row]) if row < n else (0.0, 0.0)
         _propagate_motion_to_child_link(table, row, qi, vi, 0.0, x)

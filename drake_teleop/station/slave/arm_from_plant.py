@@ -20,7 +20,7 @@ from drake_teleop.station.slave.arm import (
     DAMPING_COLUMN,
     IS_PRISMATIC_COLUMN,
     LAST_ROW_GRAVITY_COLUMN,
-    NUM_TABLE_COLUMNS,
+    NUM_ARM_TABLE_COLUMNS,
     PHI_COLUMN,
     ROTATION_COLUMN,
     ROTOR_COLUMN,
@@ -42,8 +42,8 @@ def ArmModelFromPlant(
 ) -> ArmModel:
     """Return the arm between the world and the sensor frame of a finalized plant.
 
-    A DrakeTeleopError is raised if a joint between them is not revolute, prismatic or a weld, or if
-    a further joint moves a body on their links. Joints beyond S are at their default positions.
+    A DrakeTeleopError is raised if a joint between them is not revolute, prismatic or a weld, or a
+    further joint moves a body on links. Joints beyond S are at their default positions.
     """
     if not plant.HasFrameNamed(sensor_frame_name, model_instance):
         what = f"{plant.GetModelInstanceName(model_instance)} has no frame {sensor_frame_name!r}"
@@ -56,7 +56,7 @@ def ArmModelFromPlant(
     motors = [[a for a in actuators if a.joint().index() == j.index()] for j in joints]
     efforts = [min((motor.effort_limit() for motor in each), default=np.inf) for each in motors]
     n = len(joints)
-    table = np.zeros((n + 1, NUM_TABLE_COLUMNS))
+    table = np.zeros((n + 1, NUM_ARM_TABLE_COLUMNS))
     for row, joint in enumerate(joints):
         table[row, ROTOR_COLUMN] = sum(motor.default_reflected_inertia() for motor in motors[row])
         table[row, DAMPING_COLUMN] = joint.default_damping()
@@ -96,7 +96,7 @@ def ArmModelFromPlant(
 def _joint_limits(joint: OneAxisJoint) -> tuple[float, float, float, float]:
     """Return lower, upper, speed and acceleration limit of a joint; infinite for no limit."""
     lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
-    limit = chain_joints.MAX_PLAUSIBLE_LIMIT_RAD_OR_M
+    limit = chain_joints.MAX_JOINT_POSITION_LIMIT_SI
     # Exporters write 0 to 0 for unknown limits.
     is_unknown = isinstance(joint, tree.RevoluteJoint) and lower == upper == 0.0
     lower = -np.inf if is_unknown or lower < -limit else lower
@@ -123,7 +123,7 @@ def _moving_joints_to_sensor(plant: MultibodyPlant, frame_S: tree.Frame) -> list
 def _bodies_moved_by_joints(
     plant: MultibodyPlant, joints: list[tree.Joint], sensor_body: tree.RigidBody
 ) -> list[list[tree.BodyIndex]]:
-    """Return, per joint, bodies that move with it but not with the next; last the load."""
+    """Return, by joint, the bodies that it moves but the next does not; the load is last."""
     outboard = [set(plant.GetBodiesKinematicallyAffectedBy([j.index()])) for j in joints]
     load = {body.index() for body in chain_joints.bodies_carried_by(plant, sensor_body)}
     rows = [inner - outer - load for inner, outer in pairwise([*outboard, set()])]
@@ -141,7 +141,7 @@ def _bodies_moved_by_joints(
 def values_per_joint(
     arm: ArmModel, values: Sequence[float], where: str, default: float | Array | None = None
 ) -> Array:
-    """Return one value per joint (n,); with a `default`, `values` may be empty or one for all."""
+    """Return values (n,); with a `default`, `values` may be empty, or one number for all joints."""
     n = arm.num_joints
     if len(values) not in ((n,) if default is None else (0, 1, n)):
         one = "" if default is None else "one for all, or "
@@ -156,8 +156,8 @@ def fill_missing_joint_limits(
 ) -> tuple[ArmModel, list[str]]:
     """Return the arm with defaults for missing joint limits, and one text per assumed default.
 
-    `acceleration` contains no, 1 or n limits [rad/s^2] that replace the model's; `hint` is appended
-    to the text about accelerations.
+    `acceleration` contains 0, 1 or n limits [rad/s^2] that replace the model's; `hint` ends the
+    text about accelerations.
     """
     assumptions = []
     slides = arm.table[:-1, IS_PRISMATIC_COLUMN] != 0.0

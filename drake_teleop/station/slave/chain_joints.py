@@ -1,4 +1,4 @@
-"""Search and edits of joints in a parsed plant: welds, motors, and sticks for arms without shapes.
+"""Search and edits of joints in a parsed plant: welds, motors, visual sticks for missing shapes.
 
 The chain is the list of joints from the base outwards to the sensor, welds included.
 """
@@ -28,7 +28,7 @@ _PRISMATIC_DRIVE_MASS_KG = 5.0  # mass that moves with a prismatic joint instead
 # Largest mass of a sensor body that is only a frame, and its largest distance to the origin of the
 # link that it shares.
 _MAX_FRAME_MASS_KG, _MAX_FRAME_OFFSET_M = 1e-6, 1e-6
-MAX_PLAUSIBLE_LIMIT_RAD_OR_M = 1e4  # larger: no limit; SDF specifies 1e16
+MAX_JOINT_POSITION_LIMIT_SI = 1e4  # larger: no limit; SDF specifies 1e16
 _SKELETON_CAPSULE_RADIUS_M = 0.035
 _SKELETON_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
 
@@ -81,7 +81,7 @@ def weld_base_and_find_chain(
 ) -> list[Joint]:
     """Weld a free base to the world at `X_WBase` (None: identity); return the chain to `frame`.
 
-    A DrakeTeleopError is raised if a joint moves the base on the world and X_WBase is not identity.
+    A DrakeTeleopError is raised if the base moves, as on a rail, and X_WBase is not identity.
     """
     chain, X_WB = chain_to_body(plant, frame.body()), X_WBase or RigidTransform()
     base = chain[0].parent_body() if chain else frame.body()
@@ -109,7 +109,7 @@ def move_bodies_welded_to_world(
 def weld_free_bodies(
     plant: MultibodyPlant, instances: Iterable[tree.ModelInstanceIndex]
 ) -> list[str]:
-    """Weld bodies without a joint to the world; return at most one note."""
+    """Weld bodies without a joint to the world; return a text on them."""
     held = joints_by_child(plant)
     bodies = [plant.get_body(k) for each in instances for k in plant.GetBodyIndices(each)]
     free = [body for body in bodies if body.index() not in held]
@@ -142,9 +142,9 @@ def check_chain(
 def weld_held_joints(
     plant: MultibodyPlant, frame: Frame, hold: dict[str, float], joints: Iterable[tree.JointIndex]
 ) -> list[str]:
-    """Weld the joints in `hold` at the given positions [rad, m]; return one note per joint.
+    """Weld the joints in `hold` at the given positions [rad, m]; return a text per joint.
 
-    Of joints with equal names, that inboard of `frame` is welded.
+    Of joints with one name, that inboard of `frame` is welded.
     """
     ordered = *map(plant.get_joint, joints), *chain_to_body(plant, frame.body())
     known = {joint.name(): joint for joint in ordered if joint.num_velocities() > 0}
@@ -160,7 +160,7 @@ def weld_held_joints(
         lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
         if lower < upper and not lower <= position <= upper:
             what = f"{name} at {position:g} is outside its limits, {lower:g} to {upper:g}"
-            raise DrakeTeleopError(what, where="slave.hold", remedy="check the value and its unit")
+            raise DrakeTeleopError(what, where="slave.hold", remedy="check its value and unit")
         joint.set_default_positions(np.array([position]))
         _replace_joint_by_weld(plant, joint)
     return [f"held at {position:g}: {name}" for name, position in hold.items()]
@@ -169,9 +169,9 @@ def weld_held_joints(
 def weld_joints_outside_chain(
     plant: MultibodyPlant, joints_before: set[tree.JointIndex], chain: list[Joint]
 ) -> list[str]:
-    """Remove constraints, and weld moving joints outside `chain`; return notes.
+    """Remove constraints, and weld moving joints outside `chain`; return a text.
 
-    Joints in `joints_before`, which the plant had before the model was parsed, remain.
+    `joints_before`, which the plant had before the model, remain.
     """
     for constraint in plant.GetConstraintIds():  # for example of coupled fingers
         plant.RemoveConstraint(constraint)
@@ -186,10 +186,10 @@ def weld_joints_outside_chain(
 def weld_load_of_link_to_sensor_frame(
     plant: MultibodyPlant, frame: Frame, chain: list[Joint]
 ) -> list[str]:
-    """Weld bodies that share a link with the sensor body to that body, so that they become load.
+    """Weld bodies beside a massless sensor body, on the same link, to it: they become load.
 
-    This applies if the sensor body is massless and welded to the link. If its origin is not that of
-    the link, the bodies remain part of the robot; the returned list then has a note on them.
+    If the sensor's origin is not that of the link, the bodies remain part of the arm, and a text
+    on them is returned.
     """
     X_LS = frame.GetFixedPoseInBodyFrame()
     for inboard in reversed(chain):
@@ -283,9 +283,9 @@ def set_torque_limits(
 def add_rotor_inertias(
     plant: MultibodyPlant, chain: list[Joint], frame: Frame, auxiliary_bodies: set[str]
 ) -> list[str]:
-    """Add a rotor inertia to each joint of the chain that moves no inertia; return notes.
+    """Add a rotor inertia to each joint that moves no inertia up to the next joint; return texts.
 
-    A joint moves the bodies up to the next joint; joints on `auxiliary_bodies` are passed over.
+    Joints beyond `auxiliary_bodies`, which the repair of the model added, do not count.
     """
     inertia = _ROTOR_INERTIA_PER_LENGTH_SQUARED_KG * _length_of_moving_chain_m(chain, frame) ** 2
     actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
@@ -340,15 +340,15 @@ def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:
     for joint in reversed(chain_to_body(plant, sensor_frame.body())):
         start, frame = _frame_origin_in_body(joint.frame_on_child()), joint.frame_on_parent()
         if not isinstance(joint, WeldJoint):
-            _add_skeleton_capsule(plant, joint.child_body(), start, p_BEnd)
+            _add_visual_capsule(plant, joint.child_body(), start, p_BEnd)
             p_BEnd = _frame_origin_in_body(frame)
             continue
         if joint.parent_body().index() == plant.world_body().index():
-            _add_skeleton_capsule(plant, joint.child_body(), np.zeros(3), p_BEnd)
+            _add_visual_capsule(plant, joint.child_body(), np.zeros(3), p_BEnd)
         p_BEnd = _pose_of_welded_child_in_parent(joint) @ p_BEnd
 
 
-def _add_skeleton_capsule(plant: MultibodyPlant, body: RigidBody, start: Array, end: Array) -> None:
+def _add_visual_capsule(plant: MultibodyPlant, body: RigidBody, start: Array, end: Array) -> None:
     if plant.GetVisualGeometriesForBody(body):
         return
     length = float(np.linalg.norm(end - start))

@@ -1,4 +1,4 @@
-"""Start posture of the arm, by default with the tool pointing down."""
+"""Start posture of the arm, by default with the tool down."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from drake_teleop.station.slave.slave_config import Slave
 _MIN_MASS_MATRIX_EIGENVALUE_KG_M2 = 1e-9
 #: Orientation of S at home: the tool points down, x_S along x_W.
 R_WS_HOME = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
-_SEARCHED_JOINT_RANGE_SHARES = (0.7, 0.9, 1.0)  # about the middles of the ranges
+_SEARCH_TO_JOINT_RANGE_RATIOS = (0.7, 0.9, 1.0)  # about the middles of the ranges
 #: Elbow up, reaching forward [rad]; home is the branch nearest to it.
 _ELBOW_UP_POSTURE_RAD = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
 
@@ -28,12 +28,12 @@ _ELBOW_UP_POSTURE_RAD = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
 def solve_start_posture(
     arm: ArmModel, position: Array, R_WS: RotationMatrix = R_WS_HOME
 ) -> tuple[Array, IkStatus]:
-    """Return q (n,) [rad, m] at p_WS = `position` and `R_WS` (tool down), and `IkStatus`."""
+    """Return q (n,) [rad, m] with S at the pose `R_WS`, `position` [m], and the `IkStatus`."""
     if has_closed_form(arm):
         return nearest_branch(R_WS.matrix(), position, _ELBOW_UP_POSTURE_RAD, arm.lower, arm.upper)
     pose = np.array([*R_WS.ToQuaternion().wxyz(), *position])
     middle = arm.middle_positions
-    for share in _SEARCHED_JOINT_RANGE_SHARES:
+    for share in _SEARCH_TO_JOINT_RANGE_RATIOS:
         lower, upper = (middle + share * (limit - middle) for limit in (arm.lower, arm.upper))
         q, status = find_posture(replace(arm, lower=lower, upper=upper), pose, middle)
         if status == IkStatus.OK:

@@ -1,7 +1,7 @@
 """Closed-form inverse kinematics of the Staubli RX90 (Pieper 1968).
 
-At q = 0 the arm points up and S is parallel to W. The wrist centre is at (x, y, z) above the
-shoulder, at the signed distance rho from the first axis. With arm lengths l2 and l3:
+At q = 0 the arm points up and S is parallel to W. The wrist centre is at the height z above the
+shoulder and at the distance rho from the first axis, negative behind it. Arm lengths are l2, l3:
 
     rho = -(l2 sin q2 + l3 sin(q2 + q3)),   z = l2 cos q2 + l3 cos(q2 + q3),
     R_WS = Rz(q1) Ry(-q2 - q3) Rz(q4) Ry(-q5) Rz(q6)."""
@@ -24,8 +24,8 @@ SHOULDER_HEIGHT_M, UPPER_ARM_LENGTH_M = 0.420, 0.450
 #: Elbow to wrist centre [m]; wrist centre to the origin of S, along z_S [m].
 FOREARM_LENGTH_M, WRIST_TO_S_M = 0.450, 0.085
 
-# Distance from the first axis [m], or sin q5, below which the arm is singular.
-_MAX_SINGULAR_DISTANCE_OR_SIN_Q5 = 1e-9
+# Distance of the wrist from the first axis, and sin q5, below which the arm is singular.
+_MAX_SINGULAR_DISTANCE_M, _MAX_SINGULAR_SIN_Q5 = 1e-9, 1e-9
 # Tolerance of a joint limit [rad]; the angle is clipped to the limit.
 _JOINT_LIMIT_TOLERANCE_RAD = 1e-9
 
@@ -33,10 +33,9 @@ _JOINT_LIMIT_TOLERANCE_RAD = 1e-9
 class IkStatus(IntEnum):
     """Status of an inverse kinematics solution near a reference posture.
 
-    The texts of the members describe the closed form. The numeric method reports a singularity only
-    if it misses the pose: WRIST_SINGULAR if the last three axes are nearly coplanar, otherwise
-    SHOULDER_SINGULAR. With fewer than 6 joints, a missed pose is WRIST_SINGULAR, or OUT_OF_REACH if
-    the position error exceeds 1 mm.
+    Members are described for the closed form. The numeric method reports a singularity only for a
+    missed pose: WRIST_SINGULAR if the last three axes are nearly coplanar, else SHOULDER_SINGULAR.
+    With fewer than 6 joints: WRIST_SINGULAR, or OUT_OF_REACH for position errors above 1 mm.
     """
 
     OK = 0
@@ -82,7 +81,7 @@ def _solve_all_branches_into(R: Array, p: Array, q1_kept: float, q4_kept: float,
         distance *= scale
         status = _OUT_OF_REACH
     rho = np.sqrt(x * x + y * y)
-    if rho < _MAX_SINGULAR_DISTANCE_OR_SIN_Q5:
+    if rho < _MAX_SINGULAR_DISTANCE_M:
         q1_front = q1_kept
         status = max(status, _SHOULDER_SINGULAR)
     else:
@@ -110,7 +109,7 @@ def _solve_all_branches_into(R: Array, p: Array, q1_kept: float, q4_kept: float,
             m00 = c * (c1 * R[0, 0] + s1 * R[1, 0]) + s * R[2, 0]
             m01 = c * (c1 * R[0, 1] + s1 * R[1, 1]) + s * R[2, 1]
             sin_q5 = np.sqrt(m02 * m02 + m12 * m12)
-            q4_up = q4_kept if sin_q5 < _MAX_SINGULAR_DISTANCE_OR_SIN_Q5 else np.arctan2(-m12, -m02)
+            q4_up = q4_kept if sin_q5 < _MAX_SINGULAR_SIN_Q5 else np.arctan2(-m12, -m02)
             q5_up = np.arctan2(sin_q5, m22)
             # q6 depends on q4, so that an inexact q4 near the singularity cancels.
             c4, s4 = np.cos(q4_up), np.sin(q4_up)
@@ -166,7 +165,7 @@ def _nearest_branch_into(
     if best < 0:
         return _JOINT_LIMIT
     copy_into(q, 0, branches[best], 0, 6)
-    if abs(np.sin(q[4])) < _MAX_SINGULAR_DISTANCE_OR_SIN_Q5:
+    if abs(np.sin(q[4])) < _MAX_SINGULAR_SIN_Q5:
         status = max(status, _WRIST_SINGULAR)
     return status
 
@@ -175,7 +174,7 @@ def _nearest_branch_into(
 def solve_pose_command(
     pose: Array, reference: Array, lower: Array, upper: Array, max_step: float, q: Array
 ) -> int:
-    """Write the solution of `nearest_branch` for pose X_WS (7,) to q (6,); return `IkStatus`."""
+    """Write the solution nearest to `reference` for X_WS (7,) to q (6,); return `IkStatus`."""
     w, x, y, z = pose[0], pose[1], pose[2], pose[3]
     norm = w * w + x * x + y * y + z * z
     k = 2.0 / norm if norm > 0.0 else np.nan
@@ -196,9 +195,9 @@ def nearest_branch(
 ) -> tuple[Array, IkStatus]:
     """Return the solution within the limits nearest to a reference (6,) [rad], and the `IkStatus`.
 
-    Solutions in which a joint is over `max_step` [rad] from the reference are discarded. A wrist
-    centre out of reach is replaced by the nearest one in reach. Without a solution, the reference,
-    clipped to the limits, is returned.
+    Solutions with a joint over `max_step` [rad] from the reference are discarded. A wrist centre
+    out of reach is replaced by the nearest one in reach. Without a solution, the clipped reference
+    is returned.
     """
     q = np.empty(6)
     # Drake's matrices are stored by columns; one layout avoids a second compilation.
@@ -222,8 +221,8 @@ def has_closed_form(arm: ArmModel) -> bool:
 class InverseKinematics(LeafSystem):
     """Block that converts a commanded pose to joint positions in closed form.
 
-    If each solution violates a joint limit or is over `MAX_JOINT_JUMP_RAD` from the measured
-    positions, it outputs the measured positions, clipped to the limits.
+    If each solution violates a joint limit or is over 2 rad from the measured positions, it outputs
+    these, clipped to the limits.
 
     .. pydrake_system::
 

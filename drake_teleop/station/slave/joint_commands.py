@@ -37,8 +37,8 @@ IK_METHODS: Registry[Callable[[ArmModel, Array, float], LeafSystem]] = Registry(
 _JOINT_LIMIT_TOLERANCE_TO_RANGE_RATIO = 0.01
 
 
-def used_ik_method(name: str, arm: ArmModel) -> str:
-    """Return the `IK_METHODS` key of setting `name`; raise DrakeTeleopError if the arm lacks it."""
+def pick_ik_method(name: str, arm: ArmModel) -> str:
+    """Return the method for setting `name`; raise DrakeTeleopError for an unsupported arm."""
     if name == AUTOMATIC_IK_METHOD:
         return "closed_form" if has_closed_form(arm) else "numeric"
     if name == "closed_form" and not has_closed_form(arm):
@@ -86,7 +86,7 @@ class LeaderJointFollower(LeafSystem):
 
 
 class ExcitationCommand(LeafSystem):
-    """Block that commands one period of a trajectory from `start` [s], and holds its ends."""
+    """Block that commands one period of a trajectory from `start` [s]; its ends hold outside."""
 
     __slots__ = NO_EXTRA_SLOTS
 

@@ -1,7 +1,6 @@
 """Joint control of the slave: computed torque (paper, VI-A), or the position interface of an arm.
 
-Position interface (docs/station.md):
-command --[dead time, hold]--> target --[generator]--> reference r --[drives]--> torque
+Position interface: command --[dead time, hold]--> target --[generator]--> reference r --> torque
 
 d2r/dt2 = acceleration_per_error (target - (r + lookahead dr/dt))
 d2q/dt2 = d2r/dt2 + 2 w (dr/dt - dq/dt) + w^2 (r - q),  w = 2 pi drive_bandwidth_hz"""
@@ -32,16 +31,16 @@ COMPUTED_TORQUE_SERVO_NAME = "computed_torque"
 @settings
 @dataclass
 class PositionInterface:
-    """Settings of an arm's interface for position commands; prismatic joints have m, not rad."""
+    """Settings of a robot controller for position commands; for prismatic joints rad means m."""
 
     command_hz: float = quantity(500.0, "Hz", 1.0, 1e4, "rate of the commands")
-    dead_time: float = quantity(0.004, "s", 0.0, 1.0, "dead time, rounded to periods of command_hz")
+    dead_time: float = quantity(0.004, "s", 0.0, 1.0, "command delay; multiple of 1 / command_hz")
     acceleration_per_error: float = quantity(300.0, "1/s^2", 1.0, 1e7, "acceleration per error")
-    lookahead: float = quantity(0.1, "s", 1e-4, 2.0, "delay behind a command of constant speed")
+    lookahead: float = quantity(0.1, "s", 1e-4, 2.0, "lag behind a command of constant speed")
     max_speed: float = quantity(
-        math.pi, "rad/s", 1e-3, 100.0, "speed limit, unless the model's (or assumed) one is lower"
+        math.pi, "rad/s", 1e-3, 100.0, "joint speed limit, unless that of the model is lower"
     )
-    max_acceleration: float = quantity(40.0, "rad/s^2", 1e-2, 1e4, "acceleration limit, likewise")
+    max_acceleration: float = quantity(40.0, "rad/s^2", 1e-2, 1e4, "limit of joint acceleration")
     drive_bandwidth_hz: float = quantity(30.0, "Hz", 0.1, 1e3, "drives' bandwidth; sets stiffness")
 
     def check(self, where: str, rate: float) -> None:
@@ -65,7 +64,7 @@ class PositionInterface:
             raise DrakeTeleopError(what, where=f"{where}.drive_bandwidth_hz", remedy=remedy)
 
 
-_position_interfaces = {
+_interface_presets = {
     "ur_servoj": PositionInterface(),
     "franka_position": PositionInterface(
         command_hz=1000.0,
@@ -78,7 +77,7 @@ _position_interfaces = {
     ),
 }
 #: Interfaces by name; docs/station.md lists the sources.
-POSITION_INTERFACE_PRESETS = Presets(_position_interfaces)
+POSITION_INTERFACE_PRESETS = Presets(_interface_presets)
 
 
 @settings
@@ -86,16 +85,16 @@ POSITION_INTERFACE_PRESETS = Presets(_position_interfaces)
 class JointControlConfig:
     """Settings of the slave's joint control: computed torque or a position interface."""
 
-    position_bandwidth_hz: float = quantity(12.0, "Hz", 0.1, 1e4, "position loop bandwidth (E)")
-    velocity_bandwidth_hz: float = quantity(70.0, "Hz", 0.1, 1e4, "velocity loop bandwidth (E)")
+    position_bandwidth_hz: float = quantity(12.0, "Hz", 0.1, 1e4, "position bandwidth (estimate)")
+    velocity_bandwidth_hz: float = quantity(70.0, "Hz", 0.1, 1e4, "velocity bandwidth (estimate)")
     servo: str = choice(
         COMPUTED_TORQUE_SERVO_NAME,
         (COMPUTED_TORQUE_SERVO_NAME, *POSITION_INTERFACE_PRESETS, "position"),
-        "computed_torque: uses the bandwidths above; position: interface with the fields of"
-        " `interface`; others: position interfaces of arms",
+        "computed_torque: with position_bandwidth_hz and velocity_bandwidth_hz; position: position"
+        " interface with the settings `interface`; others: presets for arms",
     )
     interface: PositionInterface | None = plain(
-        None, "position interface that replaces that of the servo; null: the servo's"
+        None, "settings of the position interface; null: those of the preset `servo`"
     )
 
     @property
@@ -150,9 +149,9 @@ class JointControlConfig:
 def computed_torque_into(table, command, state, kp, kv, speed_limit, effort_limit, scratch, torque):
     """Write the computed torque (n,) [N m], tau = ID(q, v, kv (clip(kp (q_command - q)) - v)).
 
-    ID is the inverse dynamics, `state` [q; v]. The joint speed kp (q_command - q) is clipped to
-    `speed_limit`, and tau to `effort_limit`. Invalid encoder readings give gravity compensation at
-    the commanded posture. An invalid command leaves the torque unchanged.
+    ID is the inverse dynamics, `state` [q; v]. The inner clip is to `speed_limit`; tau is clipped
+    to `effort_limit`. Invalid encoder readings give gravity compensation at the commanded posture.
+    An invalid command keeps the torque.
     """
     if not are_valid_port_values(command):
         return
@@ -180,13 +179,13 @@ def servo_gains_and_limits(
 
 @njit(cache=True)
 def _advance_joint_reference(command, interface, limits, memory, reference):
-    """Read the command (n,) [rad] if one is due, and advance the reference by one period.
+    """Read the command (n,) [rad] once per command period; advance the reference by a period.
 
     Args:
         interface: (6,) period [s], acceleration per error [1/s^2], lookahead [s], drive bandwidth
             [rad/s], periods per command, length of the command queue.
         limits: (2, n) speed and acceleration limits.
-        memory: updated, see `_PERIODS_SINCE_COMMAND_INDEX`.
+        memory: updated: periods since a command, queue index, target, r, dr/dt, command queue.
         reference: (3, n) output: reference position, velocity, acceleration.
     """
     period, gain, lookahead, _, periods_per_command, queue_length = interface
@@ -227,9 +226,8 @@ def position_servo_torque_into(
 ):  # fmt: skip
     """Write the motor torques (n,) for the next period, within `effort_limit` (n,) [N m].
 
-    `state` is [q; v], `scratch` (6, n), other arguments as in `_advance_joint_reference`. An
-    invalid command is replaced by the last one. If encoder readings are invalid, the torque
-    compensates gravity at the reference.
+    `state` is [q; v], `scratch` (6, n); `_advance_joint_reference` explains the others. The last
+    command replaces an invalid one. With invalid encoder readings the torque compensates gravity.
     """
     n = torque.shape[0]
     _advance_joint_reference(command, interface, limits, memory, scratch)
@@ -249,7 +247,7 @@ def position_servo_torque_into(
         torque[i] = min(max(torque[i], -effort_limit[i]), effort_limit[i])
 
 
-def _interface_constants_and_memory(
+def _position_servo_constants_and_memory(
     arm: ArmModel, interface: PositionInterface, period: float, q_start: Array
 ) -> tuple[tuple[Array, ...], Array]:
     n, queued = arm.num_joints, round(interface.dead_time * interface.command_hz)
@@ -298,7 +296,7 @@ class JointControl(LeafSystem):
             self._constants = (*servo_gains_and_limits(arm, config), np.zeros(3 * n))
         else:
             self._servo, self._groups = position_servo_torque_into, [1, 0]
-            arguments = _interface_constants_and_memory(arm, interface, period, q_start)
+            arguments = _position_servo_constants_and_memory(arm, interface, period, q_start)
             self._constants, memory = arguments
             self.DeclareDiscreteState(memory)
 
@@ -356,8 +354,8 @@ def servo_impedance(
     """Return stiffness K, damping D and mass of the slave at the tool, each (2,), in SI units.
 
     The first number is for translation, the second for rotation. The servo acts as the wrench K
-    (x_command - x) - D v. Mass m and inertia J are the smallest that satisfy diag(m, m, m, J, J, J)
-    >= Lambda (`operational_inertia`) in the ratio of the largest eigenvalues of its two blocks.
+    (x_command - x) - D v. Mass m and inertia J are the smallest for which diag(m, m, m, J, J, J) -
+    Lambda is positive semidefinite; m / J is the ratio of its blocks' largest eigenvalues.
     """
     config.require_computed_torque("the servo model of the passivity methods")
     inertia = operational_inertia(arm, q)

@@ -32,16 +32,16 @@ _ROBOT_PACKAGE_REMEDY = "with --package-path for package://"
 _SCENE_PACKAGE_REMEDY = "its package:// addresses in folders around it"
 # Places in Drake's source and in repaired texts, which the user does not have.
 _DRAKE_SOURCE_PREFIX_PATTERN = re.compile(r"Failure at \S+ in \w+(\(\))?: ")
-_STRING_LOCATION_IN_MESSAGE_PATTERN = re.compile(r"<(literal|data)-string>(\.\w+)?(:\d+)*:? ?")
+_REPAIRED_TEXT_LOCATION_PATTERN = re.compile(r"<(literal|data)-string>(\.\w+)?(:\d+)*:? ?")
 _REPAIRED_FILE_PATTERN = r"(file://)?{folder}/\d+_([^\s:'\"]*)(:\d+)*"
-_MAX_ERROR_SEPARATORS_LENGTH = 30  # " ... " and separators of the error line
+_NUM_SEPARATOR_CHARACTERS = 30  # " ... " and separators of the error line
 
 
 def repair_and_parse_model(
     plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...], purpose: ModelPurpose
 ) -> tuple[list[ModelInstanceIndex], ModelRepair]:
     if not os.path.isfile(path):
-        raise DrakeTeleopError("there is no such file", where=str(path), remedy="correct the path")
+        raise DrakeTeleopError("file does not exist", where=str(path), remedy="correct the path")
     kind = path.suffix.lower()
     if kind == ".xacro":
         raise DrakeTeleopError(_XACRO_FAULT, where=str(path), remedy=XACRO_REMEDY)
@@ -89,7 +89,7 @@ def _add_directives(parser: parsing.Parser, model: ModelRepair) -> list[ModelIns
         if file is None:
             continue  # Drake reports it
         if file not in parts:
-            parts[file] = model.repair_part(file, _repair_model_text)
+            parts[file] = model.repair_file(file, _repair_model_text)
         if parts[file].text:
             added.file = f"file://{model.write_file(file.name, parts[file].text)}"
         reasons = parts[file].dependence_reasons
@@ -134,9 +134,9 @@ def ParseModel(
 ) -> ParsedArm:
     """Parse an arm into a plant; only the joints up to S move, each with one actuator.
 
-    S is `sensor_frame`. `X_WBase` places a free base, or all links on the world. Joints in `hold`
-    are welded at the given positions [rad, m], joints beside the chain, such as a gripper's, at
-    their defaults. Unreadable or contradictory models raise DrakeTeleopError.
+    S is `sensor_frame`. `X_WBase` places a free base, or all links welded to the world. Joints in
+    `hold` are welded at these positions [rad, m], joints beside the chain at their defaults.
+    Unreadable or contradictory models raise DrakeTeleopError.
     """
     before, hold, where = set(plant.GetJointIndices()), hold or {}, str(path)
     purpose = ModelPurpose(sensor_frame, hold)
@@ -192,18 +192,18 @@ def ParseTool(
 
 
 def ParseScene(plant: MultibodyPlant, path: Path) -> list[str]:
-    """Parse surroundings; return texts about data that are assumed or have no effect.
+    """Parse surroundings; return texts about assumed or ineffective data.
 
-    A DrakeTeleopError is raised for mimic joints and for links that float on other links.
+    Mimic joints and links that float on links raise DrakeTeleopError.
     """
     instances, model = repair_and_parse_model(plant, path, (), ModelPurpose(is_scene=True))
     for name, what in model.dependence_reasons.items():
-        remedy = "remove this dependence; surroundings need independent joints and links"
+        remedy = "make it independent, as all joints and links of surroundings must be"
         raise DrakeTeleopError(f"{name} {what}", where=str(path), remedy=remedy)
     for joint in (plant.get_joint(k) for each in instances for k in plant.GetJointIndices(each)):
         limits = *joint.position_lower_limits(), *joint.position_upper_limits()
-        if any(abs(limit) < chain_joints.MAX_PLAUSIBLE_LIMIT_RAD_OR_M for limit in limits):
-            model.add_assumption("no position limits, which the model has, of", joint.name())
+        if any(abs(limit) < chain_joints.MAX_JOINT_POSITION_LIMIT_SI for limit in limits):
+            model.add_assumption("no effect of the position limits in the file on", joint.name())
     return model.assumptions
 
 
@@ -225,7 +225,7 @@ def _find_sensor_frame(
 def translate_drake_errors(
     path: Path, folder: str = "", *, is_scene: bool = False
 ) -> Iterator[None]:
-    """Convert Drake's exceptions in this context to a DrakeTeleopError that names the model file.
+    """Convert Drake's exceptions in a with-block to a DrakeTeleopError that names the model file.
 
     Messages name the original files instead of repaired copies in `folder`.
     """
@@ -236,13 +236,13 @@ def translate_drake_errors(
     # SystemExit: failed condition in Drake; LookupError: from C++ containers.
     except (RuntimeError, SystemExit, ValueError, LookupError) as error:
         reason = _DRAKE_SOURCE_PREFIX_PATTERN.sub("", " ".join(str(error).split()))
-        reason = _STRING_LOCATION_IN_MESSAGE_PATTERN.sub("", reason)
+        reason = _REPAIRED_TEXT_LOCATION_PATTERN.sub("", reason)
         if folder:
             reason = re.sub(_REPAIRED_FILE_PATTERN.format(folder=re.escape(folder)), r"\2", reason)
         what = f"cannot be read as a {'scene' if is_scene else 'robot'}"
         packages = _SCENE_PACKAGE_REMEDY if is_scene else _ROBOT_PACKAGE_REMEDY
         remedy = f"give a URDF, SDF, MJCF or .dmd.yaml model, {packages}"
-        room = MAX_ERROR_LINE_LENGTH - _MAX_ERROR_SEPARATORS_LENGTH - len(f"{path}{what}{remedy}")
+        room = MAX_ERROR_LINE_LENGTH - _NUM_SEPARATOR_CHARACTERS - len(f"{path}{what}{remedy}")
         if len(reason) > room:
             reason = f"{reason[:room]} ..."
         raise DrakeTeleopError(what, where=str(path), remedy=f"{remedy} ({reason})") from None
@@ -250,7 +250,7 @@ def translate_drake_errors(
 
 @contextmanager
 def raise_logged_errors() -> Iterator[None]:
-    """Raise RuntimeError at the end if Drake logged an error or a message about an inertia."""
+    """Raise RuntimeError after the block if Drake logged an error or an inertia message."""
     errors: list[str] = []
 
     def collect_error_message(record: logging.LogRecord) -> bool:

@@ -44,11 +44,11 @@ _MIN_OUT_OF_REACH_ERROR_M = 5e-6
 _MIN_OUT_OF_REACH_SEARCH_ERROR_M = 1e-3
 # The same for the position [m] of an arm with fewer than 6 joints, which always misses a part of
 # the orientation. 1 mm is visible at the tool, and about the repeatability of small arms.
-_MIN_OUT_OF_REACH_ERROR_FEW_JOINTS_M = 1e-3
+_MIN_OUT_OF_REACH_ERROR_BELOW_6_DOF_M = 1e-3
 # Largest joint displacement to escape from a singularity [rad, m].
 _MAX_SINGULARITY_ESCAPE_RAD_OR_M, _SEARCH_SINGULARITY_ESCAPE_RAD_OR_M = 0.05, 0.3
 # Triple product of the last three axes below which the wrist is singular.
-_MAX_SINGULAR_WRIST_TRIPLE_PRODUCT = 0.1
+_MAX_COPLANAR_WRIST_TRIPLE_PRODUCT = 0.1
 
 _STATUS_OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, *_others = map(int, IkStatus)
 _JOINT_LIMIT, _BAD_POSE, _SPEED_LIMIT = _others
@@ -56,9 +56,9 @@ _JOINT_LIMIT, _BAD_POSE, _SPEED_LIMIT = _others
 
 @njit(cache=True)
 def _pose_error_into(table, L, pose, q, x, J, e, Jt_e):
-    """Write Jacobian J (6, n), pose error e (6,) and J^T e (n,), to `Jt_e`, at q; return |e|^2.
+    """Write Jacobian J (6, n), pose error e (6,) and `Jt_e` = J^T e (n,) at q; return |e|^2.
 
-    Rotational rows of J and e are multiplied by L.
+    Rotational rows of J and e are multiplied by L [m]; x (21,) is scratch memory.
     """
     jacobian_and_pose(table, q, J, x)
     a = vectors.normalized_quaternion(vectors.quaternion_at(pose, 0))
@@ -119,7 +119,10 @@ def _is_joint_pushed_against_limit(q, lower, upper, i, push):
 
 @njit(cache=True)
 def _take_damped_step_within_limits(H, g, damping, q, lower, upper, trial):
-    """Write q + (H + damping I)^-1 g, within limits, to `trial` (n,); return the largest step."""
+    """Write q + (H + damping I)^-1 g, within limits, to `trial` (n,); return the largest step.
+
+    H (n, n) is the Gram matrix J^T J, g (n,) minus the gradient of the cost.
+    """
     n = q.shape[0]
     M, d, fixed, held = np.empty((n, n)), np.empty(n), np.zeros(n), np.empty(n, np.bool_)
     for i in range(n):
@@ -156,7 +159,7 @@ def _classify_wrist_or_shoulder_singularity(L, J):
         vectors.vector_at(J[3:, n - 2], 0),
         vectors.vector_at(J[3:, n - 1], 0),
     )
-    coplanar = abs(vectors.dot(a, vectors.cross(b, c))) < _MAX_SINGULAR_WRIST_TRIPLE_PRODUCT * L**3
+    coplanar = abs(vectors.dot(a, vectors.cross(b, c))) < _MAX_COPLANAR_WRIST_TRIPLE_PRODUCT * L**3
     return _WRIST_SINGULAR if coplanar else _SHOULDER_SINGULAR
 
 
@@ -206,7 +209,7 @@ def follow_pose(
     _gram_matrix_of_size_into(J, B)
     damping = max(min_singular_value * min_singular_value - _find_smallest_eigenpair(B, u), 0.0)
     before, missed, expected_gain = np.inf, 0.0, 0.0
-    limit = _MIN_OUT_OF_REACH_ERROR_FEW_JOINTS_M if n < 6 else _MIN_OUT_OF_REACH_ERROR_M
+    limit = _MIN_OUT_OF_REACH_ERROR_BELOW_6_DOF_M if n < 6 else _MIN_OUT_OF_REACH_ERROR_M
     while True:
         anchor = q.copy()
         cost, relative_damping, stalled_steps, better = squared, _INITIAL_RELATIVE_DAMPING, 0, True
@@ -356,8 +359,8 @@ def _follow_command(
 class NumericInverseKinematics(LeafSystem):
     """Block that converts a commanded pose to joint positions, for any serial arm.
 
-    Its ports are those of `InverseKinematics`. Joints continue from the last command, not from the
-    measured position, so that a redundant arm does not drift towards another posture.
+    Its ports are those of `InverseKinematics`. Joints continue from the last command, not the
+    measured position, so that a redundant arm does not drift.
     """
 
     __slots__ = NO_EXTRA_SLOTS

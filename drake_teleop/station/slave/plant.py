@@ -24,7 +24,7 @@ from drake_teleop.station.slave import arm_from_plant, home
 from drake_teleop.station.slave.arm import DRY_FRICTION_COLUMN, ArmModel, JointFriction
 from drake_teleop.station.slave.chain_joints import bodies_carried_by, set_torque_limits
 from drake_teleop.station.slave.models import ParseModel, translate_drake_errors
-from drake_teleop.station.slave.slave_config import AddPayload, AddTool, Slave, tip_of_tool_shapes
+from drake_teleop.station.slave.slave_config import AddPayload, AddTool, Slave, p_STip_of_shapes
 from drake_teleop.station.slave.surroundings import (
     AddEnvironment,
     MakeToolContactModel,
@@ -32,7 +32,7 @@ from drake_teleop.station.slave.surroundings import (
 )
 
 # Shapes that end within this distance of the farthest end share the contact, as two fingers do [m].
-_TIP_END_TOLERANCE_M = 1e-3
+_SHARED_TIP_TOLERANCE_M = 1e-3
 _NUM_CIRCLE_POINTS = 24  # points on a circumference of a round shape
 ARM_INSTANCE_NAME = "arm"  #: name of the arm's model instance in every plant
 
@@ -49,7 +49,7 @@ class SlavePlant:
         start: (n,) joint positions at the start [rad].
         X_WS_start: (7,) pose at the start [qw qx qy qz px py pz].
         tip: (3,) p_STip, contact point of the tool [m].
-        assumptions: texts about data that the models do not have.
+        assumptions: texts about missing data of the models.
     """
 
     plant: MultibodyPlant
@@ -66,12 +66,11 @@ class SlavePlant:
     environment: Environment | None
 
     @cached_property
-    def physics_of_plant(self) -> tuple[Array, ...]:
-        """Argument `physics` of `contact_and_plant_rates_into`.
+    def compiled_constants(self) -> tuple[Array, ...]:
+        """Arrays for compiled steps of the plant (`contact_and_plant_rates_into`).
 
-        Its arrays are: `ArmModel.table` with dry friction; the load in this table, which a grasp
-        changes; compiled pairs of shapes; parameters of the sheet spring's leaf; joints of moving
-        bodies; an empty array instead of given wrenches.
+        They are: `ArmModel.table` with dry friction; a view of the load in it; compiled pairs of
+        shapes; parameters of the leaf; joints of moving bodies; no recorded wrenches.
         """
         carried = self.arm.with_load(self.arm.phi_load)
         carried.table[:-1, DRY_FRICTION_COLUMN] = self.joint_friction
@@ -81,7 +80,7 @@ class SlavePlant:
 
     @property
     def ports(self) -> dict[str, OutputPort]:
-        """Output ports of the plant, keyed by the names of the input ports that they feed."""
+        """Output ports of the plant by name of the input port that they supply."""
         plant, leaf = self.plant, self.contact.leaf_instance
         ports = {
             "slave_state": plant.get_state_output_port(self.instance),
@@ -97,11 +96,11 @@ class SlavePlant:
         return arm_from_plant.values_per_joint(self.arm, friction, "slave.friction", 0.0)
 
     @property
-    def can_touch(self) -> bool:
+    def can_tool_touch(self) -> bool:
         return len(self.contact.compiled_pairs) > 0 or bool(self.contact.drake_contact_reason)
 
     @property
-    def compiled_sheet_instance(self) -> ModelInstanceIndex | None:
+    def leaf_instance_in_compiled_law(self) -> ModelInstanceIndex | None:
         """Model instance of the leaf if the compiled law computes its contact, else None."""
         return None if self.contact.drake_contact_reason else self.contact.leaf_instance
 
@@ -125,7 +124,7 @@ def NominalSlave(slave: Slave) -> SlavePlant:
 
 
 class HashableByValue:
-    """Hashable copy of settings; copies with equal values and unchanged files are equal."""
+    """Hashable copy of settings; equal for equal values and modification times of `files`."""
 
     def __init__(self, value: Any, files: list[Path]) -> None:
         written = [path.stat().st_mtime_ns for path in files]
@@ -171,7 +170,7 @@ def AddSlavePlant(
         finalize_without_limit_warnings(plant)
     contact = ToolContactModel()
     if environment is not None and surroundings is not None:
-        _remove_shapes_without_contact(plant, scene_graph, arm_shapes)
+        _remove_visual_and_arm_shapes(plant, scene_graph, arm_shapes)
         frame = parsed.sensor_frame
         contact = MakeToolContactModel(plant, scene_graph, frame, tool, environment, surroundings)
     arm, assumptions = parsed.arm()
@@ -188,13 +187,13 @@ def AddSlavePlant(
         builder.Connect(block.GetOutputPort("generalized_force"), force)
     plant.SetDefaultPositions(instance, start)
     X_WS_start = arm.pose(start) if slave.home else start_pose(slave)
-    tip, texts = _tool_tip_S(plant, slave, parsed, arm), (*parsed.assumptions, *assumptions)
+    tip, texts = _tip_in_S(plant, slave, parsed, arm), (*parsed.assumptions, *assumptions)
     parts = plant, instance, parsed.sensor_frame, tool, arm, start, X_WS_start, tip, contact
     return SlavePlant(*parts, texts, slave, environment)
 
 
 class ParsedSlave(NamedTuple):
-    """Arm and tool in a plant that is not finalized; attributes as in `SlavePlant`."""
+    """Arm and tool in a plant that is not finalized, with attributes of `SlavePlant`."""
 
     slave: Slave
     plant: MultibodyPlant
@@ -214,7 +213,7 @@ class ParsedSlave(NamedTuple):
         arm_from_plant.check_arm_lengths(arm, str(self.slave.path))
         arm, assumed = arm_from_plant.fill_missing_joint_limits(arm, str(self.slave.path))
         if arm.num_joints < 6:
-            assumed.append(f"with {arm.num_joints} joints the tool follows only part of the pose")
+            assumed.append(f"the tool follows part of the pose, as it has {arm.num_joints} joints")
         return arm, assumed
 
 
@@ -235,7 +234,7 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
         assumptions += assumed
         if model_bodies:
             names = ", ".join(body.name() for body in model_bodies)
-            assumptions.append(f"bodies of the model on the sensor beside the tool: {names}")
+            assumptions.append(f"bodies of the model on the sensor are part of the load: {names}")
         holder = on_sensor.body_frame()
     else:
         on_sensor, holder = model_bodies[0] if model_bodies else frame.body(), frame
@@ -253,7 +252,7 @@ def finalize_without_limit_warnings(plant: MultibodyPlant) -> None:
         joint.set_position_limits(lower, upper)
 
 
-def _remove_shapes_without_contact(
+def _remove_visual_and_arm_shapes(
     plant: MultibodyPlant, scene: geometry.SceneGraph, arm_shapes: list[geometry.GeometryId]
 ) -> None:
     source = plant.get_source_id()
@@ -264,7 +263,7 @@ def _remove_shapes_without_contact(
         scene.RemoveRole(source, shape, geometry.Role.kProximity)
 
 
-def _hulls_of_carried_shapes_S(slave: Slave) -> list[Array]:
+def _hull_points_beyond_sensor_S(slave: Slave) -> list[Array]:
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.0)
     parsed = ParseSlave(plant, slave)
     finalize_without_limit_warnings(plant)
@@ -314,7 +313,7 @@ def _unit_sphere_points() -> Array:
     return np.stack([x, y, np.sin(latitudes)], axis=-1).reshape(-1, 3)
 
 
-def _tool_tip_S(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: ArmModel) -> Array:
+def _tip_in_S(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: ArmModel) -> Array:
     if slave.tip:
         return np.array(slave.tip, dtype=np.float64)
     instance = plant.get_body(parsed.tool).model_instance()
@@ -324,13 +323,13 @@ def _tool_tip_S(plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: A
             return tip.GetFixedPoseInBodyFrame().translation()
         return tip.CalcPose(plant.CreateDefaultContext(), parsed.sensor_frame).translation()
     if slave.tool is not None and slave.tool.mass > 0.0:
-        end = tip_of_tool_shapes(slave.tool)
+        end = p_STip_of_shapes(slave.tool)
         return arm.phi_load[1:4] / arm.phi_load[0] if end is None else np.array(end)
-    hulls = _hulls_of_carried_shapes_S(slave)
+    hulls = _hull_points_beyond_sensor_S(slave)
     if not hulls:
         return arm.phi_load[1:4] / arm.phi_load[0]
     reach = max(hull[:, 2].max() for hull in hulls)
-    farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _TIP_END_TOLERANCE_M]
+    farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _SHARED_TIP_TOLERANCE_M]
     middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in farthest]
     return np.array([*np.mean(middles, axis=0), reach])
 

@@ -1,4 +1,4 @@
-"""Dynamics of arm, leaf and contact inside a time step: compiled, or with Drake's contact results.
+"""Dynamics of arm, leaf and contact in a time step: compiled, or with Drake's contact results.
 
 The state x is [q, leaf deflection, v, leaf speed], then the plant's [q; v] if other bodies move.
 The compiled contact law covers spheres on boxes; Drake's law covers all shapes and contact models.
@@ -53,7 +53,7 @@ def environment_wrench_about_Wo_into(arm, pairs, joints, applied_W, q, v, sheet,
         arm: `ArmModel.table`.
         pairs: (k, 28) pairs of shapes, `ShapePairs.compiled_pairs`.
         joints: (m, 21) joints of moving bodies, from `MakeJointTableAndRowBodies`.
-        applied_W: (6,) wrench [f; tau] that is added, about So, in W [N, N m].
+        applied_W: (6,) further wrench [f; tau], about So, in W [N, N m].
         sheet: (2,) deflection of the sheet spring's leaf, and its rate [m, m/s].
         state: the plant's [q; v], unused without joints.
     """
@@ -70,7 +70,7 @@ def environment_wrench_about_Wo_into(arm, pairs, joints, applied_W, q, v, sheet,
     forward_kinematics(arm, q, R_WS, p_WS)
     add_vector_into(wrench_W, 3, cross(p_WS, applied_W))
     for pair in pairs:
-        box = _place_box_at_body(pair, bodies, placed)
+        box = _move_box_with_body(pair, bodies, placed)
         depth = depth_of_sphere_in_box(box, p_WS, R_WS, sheet[0], normal)
         if depth <= 0.0:
             continue
@@ -94,8 +94,8 @@ def environment_wrench_about_Wo_into(arm, pairs, joints, applied_W, q, v, sheet,
 
 
 @njit(cache=True)
-def _place_box_at_body(pair, bodies, placed):
-    """Return the pair, with a moving box at its present pose; `placed` (28,) is memory for that."""
+def _move_box_with_body(pair, bodies, placed):
+    """Return the pair (28,) with its box at the present pose in W; `placed` is scratch memory."""
     if pair[BOX_BODY_ROW_COLUMN] < 0.0:
         return pair
     body = bodies[int(pair[BOX_BODY_ROW_COLUMN])]
@@ -110,22 +110,22 @@ def _place_box_at_body(pair, bodies, placed):
 
 
 @njit(cache=True)
-def tool_proximity(arm, pairs, monitored_pairs, joints, q, sheet, state):
-    """Return PROXIMITY_NEAR_MONITORED, PROXIMITY_TOUCHING or PROXIMITY_FAR, the first that applies.
+def classify_tool_proximity(arm, pairs, monitored_pairs, joints, q, sheet, state):
+    """Return PROXIMITY_NEAR_MONITORED if a pair of `monitored_pairs` may be closer than 2 cm.
 
-    The tool is near within 2 cm of one of `monitored_pairs`, and touches one of `pairs`.
+    Otherwise return PROXIMITY_TOUCHING if one of `pairs` touches, else PROXIMITY_FAR.
     """
     R_WS, p_WS, normal = np.empty((3, 3)), np.empty(3), np.empty(6)
     bodies, placed = np.empty((joints.shape[0], BODY_STATE_SIZE)), np.empty(NUM_PAIR_COLUMNS)
     poses_and_twists_into(joints, state, bodies)
     forward_kinematics(arm, q, R_WS, p_WS)
     for pair in monitored_pairs:
-        box = _place_box_at_body(pair, bodies, placed)
+        box = _move_box_with_body(pair, bodies, placed)
         distance = lower_bound_of_box_distance(pair, box, p_WS, R_WS, sheet[0])
         if distance < _MAX_DISTANCE_OF_NEAR_PAIRS_M:
             return PROXIMITY_NEAR_MONITORED
     for pair in pairs:
-        box = _place_box_at_body(pair, bodies, placed)
+        box = _move_box_with_body(pair, bodies, placed)
         if depth_of_sphere_in_box(box, p_WS, R_WS, sheet[0], normal) > -_MAX_TOUCHING_GAP_M:
             return PROXIMITY_TOUCHING
     return PROXIMITY_FAR
@@ -141,8 +141,7 @@ def add_force_to_wrench(wrench_W, p_WC, force_W):
 class ToolContact(LeafSystem):
     """Block that outputs the environment's wrench (6,) on the tool about the world's origin.
 
-    The port sheet_state [z; v_z] exists only with a leaf, plant_state [q; v] only with other moving
-    bodies.
+    Ports sheet_state [z; v_z] and plant_state [q; v] exist with a leaf, with other moving bodies.
     """
 
     __slots__ = NO_EXTRA_SLOTS
@@ -181,16 +180,16 @@ def assemble_plant_state_into(state, surroundings, x):
 
 @njit(cache=True)
 def contact_and_plant_rates_into(physics, x, tau, applied_W, wrench_W, xdot):
-    """Write xdot (2 n + 2,), the derivative of arm and leaf in x, and the contact wrench about Wo.
+    """Write xdot (2 n + 2,), the state derivative of arm and leaf, and the contact wrench about Wo.
 
-    `physics` is `SlavePlant.physics_of_plant`, `tau` (n,) the motor torques [N m], `applied_W` (6,)
-    a wrench that is added, about So.
+    `physics` is `SlavePlant.compiled_constants`, `tau` (n,) the motor torques [N m], `applied_W`
+    (6,) a further wrench about So.
     """
-    arm, _, pairs, _, joints, given = physics
+    arm, _, pairs, _, joints, recorded = physics
     half = tau.shape[0] + 1
     q, v = x[: half - 1], x[half : 2 * half - 1]
     sheet, rest = x[half - 1 : 2 * half : half], x[2 * half :]
-    if not _copy_or_request_wrench(given, x, wrench_W):
+    if not _replay_or_request_wrench(recorded, x, wrench_W):
         environment_wrench_about_Wo_into(arm, pairs, joints, applied_W, q, v, sheet, rest, wrench_W)
     else:
         added, none = np.empty(6), pairs[:0]
@@ -200,27 +199,27 @@ def contact_and_plant_rates_into(physics, x, tau, applied_W, wrench_W, xdot):
 
 
 @njit(cache=True)
-def _copy_or_request_wrench(given, x, wrench_W):
-    """Copy the next given wrench to `wrench_W` and return True; if none is left, return False.
+def _replay_or_request_wrench(recorded, x, wrench_W):
+    """Copy the next recorded wrench to `wrench_W`; return False if it is not recorded.
 
-    `given` is empty, or a header and then wrenches (6,). The header contains the number of
-    wrenches, the number of calls, and the state x at which the first missing wrench is required.
+    The caller appends a wrench and repeats its step until none is missing. Row 0 of `recorded`:
+    numbers of wrenches and calls, x of the first call without wrench; other rows: wrenches (6,).
     """
-    if given.shape[0] == 0:
+    if recorded.shape[0] == 0:
         return False
-    number = int(given[0, 1])
-    given[0, 1] += 1.0
-    if number < given[0, 0]:
-        copy_into(wrench_W, 0, given[1 + number], 0, 6)
+    number = int(recorded[0, 1])
+    recorded[0, 1] += 1.0
+    if number < recorded[0, 0]:
+        copy_into(wrench_W, 0, recorded[1 + number], 0, 6)
         return True
-    if number == given[0, 0]:
-        copy_into(given[0], 2, x, 0, x.shape[0])
+    if number == recorded[0, 0]:
+        copy_into(recorded[0], 2, x, 0, x.shape[0])
     return False
 
 
 @njit(cache=True)
 def plant_rates_under_wrench_into(physics, x, tau, applied_W, wrench_W, xdot):
-    """Write xdot of `contact_and_plant_rates_into` for the given contact wrench `wrench_W` (6,)."""
+    """Write xdot of `contact_and_plant_rates_into` for the contact wrench `wrench_W` (6,)."""
     arm, _, pairs, leaf, _, _ = physics
     half = tau.shape[0] + 1
     q, v = x[: half - 1], x[half : 2 * half - 1]
@@ -275,7 +274,7 @@ class DrakeContact(LeafSystem):
 
 
 class ContactPlantCopy:
-    """Copy of the slave's plant that computes contact at any state, beside the simulated plant."""
+    """Copy of the slave's plant that computes contact at any state."""
 
     def __init__(self, config: Slave, environment: Environment | None, q_start: Array) -> None:
         builder = DiagramBuilder()

@@ -1,8 +1,8 @@
 """Shapes of arm, tool and surroundings at given joint positions: distances and overlaps.
 
 Collision shapes count, or visual shapes of a body without them; meshes count as convex hulls. As in
-MoveIt's setup assistant, overlaps are ignored if a joint or a telescope connects the bodies, or if
-nearly all random postures have them; an assumption lists the latter.
+MoveIt's setup assistant, overlaps are ignored if a joint or coaxial prismatic joints connect the
+bodies, or by design: if nearly all random postures have them.
 """
 
 from __future__ import annotations
@@ -40,20 +40,20 @@ MIN_OVERLAP_M = 1e-3  #: larger overlaps are reported; smaller ones are rounding
 _MAX_CHECKED_SHAPE_HALF_WIDTH_M = 1e3  # m; at 1e4 Drake's distance query aborts or hangs
 # Pairs that overlap in this share of random postures overlap by design.
 _NUM_SAMPLED_POSTURES, _OVERLAP_BY_DESIGN_POSTURE_SHARE = 200, 0.95
-_MIN_COSINE_OF_TELESCOPE_AXES = 0.999  # cosine of the angle between the axes of a telescope
+_MIN_COSINE_OF_PARALLEL_AXES = 0.999  # cosine of the angle between the axes of a telescope
 
 
 class PostureShapes:
     """Shapes of a slave and its surroundings in a plant, for overlaps at any joint positions.
 
     Args:
-        sticks: whether an arm without shapes gets sticks as shapes.
+        sticks: whether sticks replace all missing shapes of an arm.
 
     Attributes:
-        assumptions: texts about data that the models do not have.
+        assumptions: texts about missing data of the models.
         tool_body, tool_bodies: indices of the body on the sensor, and of all bodies beyond it.
         surroundings: indices of the bodies of the environment.
-        has_sticks: whether sticks replace the missing shapes.
+        has_sticks: whether they do.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class PostureShapes:
         return {each.index() for each in self.plant.GetBodiesWeldedTo(body)}
 
     def overlaps(self) -> list[tuple[RigidBody, RigidBody, float]]:
-        """Return pairs that overlap, not by design, and their distance [m] (minus the depth)."""
+        """Return pairs that overlap, not by design, and minus the depth of overlap [m]."""
         body, found = self.plant.get_body, self._overlap_distances()
         pairs = [pair for pair in found if pair not in self._by_design]
         return [(body(first), body(second), found[first, second]) for first, second in pairs]
@@ -119,7 +119,7 @@ class PostureShapes:
         return np.vstack([np.zeros((0, 3)), *hulls])
 
     def hull_points_W(self, index: BodyIndex, *, visual: bool = False) -> list[Array]:
-        """Return hull points (k, 3) in W [m] per shape: collision, or `visual` ones if any."""
+        """Return hull points (k, 3) in W [m] by collision shape, or by `visual` shape if any."""
         body, hulls = self.plant.get_body(index), self._points[index]
         if visual and (shapes := self.plant.GetVisualGeometriesForBody(body)):
             hulls = [hull_points_of(self._scene_graph.model_inspector(), each) for each in shapes]
@@ -161,7 +161,7 @@ class PostureShapes:
                 R_WF = joint.frame_on_parent().CalcPoseInWorld(context).rotation()
                 axis = R_WF @ joint.translation_axis()
                 for other, bodies in telescopes:
-                    if bodies & joined and abs(axis @ other) > _MIN_COSINE_OF_TELESCOPE_AXES:
+                    if bodies & joined and abs(axis @ other) > _MIN_COSINE_OF_PARALLEL_AXES:
                         joined |= bodies
                 telescopes.append((axis, joined))
             together.append(joined)
@@ -173,7 +173,7 @@ class PostureShapes:
     def _body_pairs_overlapping_by_design(self) -> set[tuple[BodyIndex, BodyIndex]]:
         random, counts = np.random.default_rng(0), Counter[tuple[BodyIndex, BodyIndex]]()
         least = int(np.ceil(_OVERLAP_BY_DESIGN_POSTURE_SHARE * _NUM_SAMPLED_POSTURES))
-        limits = joint_sampling_range(self.arm)
+        limits = random_posture_limits(self.arm)
         for left in range(_NUM_SAMPLED_POSTURES, 0, -1):
             self.move_to(random.uniform(*limits))
             counts.update(p for p in self._overlap_distances() if not self.surroundings & set(p))
@@ -182,8 +182,8 @@ class PostureShapes:
         return {pair for pair, count in counts.items() if count >= least}
 
 
-def joint_sampling_range(arm: ArmModel) -> tuple[Array, Array]:
-    """Return finite lower and upper limits (n,): +-pi if infinite, or if beyond both -pi and pi."""
+def random_posture_limits(arm: ArmModel) -> tuple[Array, Array]:
+    """Return finite joint limits (n,): +-pi for infinite ones, or ranges beyond -pi to pi."""
     wide = arm.upper - arm.lower > 2.0 * np.pi + 1e-9
     around_zero = wide & (arm.lower <= -np.pi) & (arm.upper >= np.pi)
     finite_lower = np.where(np.isfinite(arm.lower), arm.lower, -np.pi)
@@ -221,13 +221,13 @@ def overlap_warnings(shapes: PostureShapes, *, slave_only: bool = False) -> list
         remedy = "give another start in slave.home, or correct the shapes of the model"
         if with_surroundings:
             remedy = "move the object in environment, or give another start in slave.home"
-        what = f"{first.name()} and {second.name()} overlap by {-1e3 * distance:.1f} mm"
-        found.append(f"{what} at the start (convex hulls of meshes count); {remedy}")
+        what, depth = f"{first.name()} and {second.name()}", f"{-1e3 * distance:.1f} mm"
+        found.append(f"{what} overlap by {depth} at the start (convex hulls of meshes); {remedy}")
     return found
 
 
 def _prepare_shapes_for_distances(plant: MultibodyPlant, scene_graph: geometry.SceneGraph) -> None:
-    """Turn visual shapes of bodies without collision shapes into such; remove unbounded shapes."""
+    """Make visual shapes the collision shapes where missing; remove unbounded shapes."""
     # Polyhedra replace curved shapes, because Drake's distance query may hang for capsules.
     inspector, source = scene_graph.model_inspector(), plant.get_source_id()
     added = []  # afterwards, because Drake's lists move when shapes are added

@@ -4,7 +4,7 @@ Each event predicts the motion, one midpoint step per sample of the controller:
 
     tau_k = servo(x_k),  x_k+1 = x_k + T f(x_k + T/2 f(x_k, tau_k), tau_k),  k = 0 .. m - 1
 
-The plant receives the torque a + b (t - h/2), with the area and first moment of these steps."""
+The plant receives the torque a + b (t - h/2) with the integral and first moment of the tau_k."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from drake_teleop.station.slave.plant_dynamics import (
     contact_and_plant_rates_into,
 )
 
-#: Event rate [Hz]; over longer intervals a line differs too much from the servo's samples.
+#: Event rate [Hz]; over longer intervals a ramp differs too much from the servo's samples.
 _MIN_SERVO_EVENT_HZ = 2000.0
 
 
 def servo_samples_per_event(control_hz: float, hand_hz: float) -> int:
     """Return the largest number of servo samples per event that keeps events at 2 kHz or more.
 
-    Each sample of the haptic device remains an event. Arguments are rates [Hz].
+    Events include each sample of the haptic device. Arguments are rates [Hz].
     """
     ratio = control_hz / hand_hz
     whole = round(ratio)
@@ -44,7 +44,7 @@ def servo_samples_per_event(control_hz: float, hand_hz: float) -> int:
 
 
 @njit(cache=True)
-def predict_torque_ramp(arm, command, state, sheet, servo, physics, samples, period, scratch, line):
+def predict_torque_ramp(arm, command, state, sheet, servo, physics, samples, period, scratch, ramp):
     """Write the motor torque over the next `samples` of the servo as a linear function of time.
 
     Args:
@@ -53,14 +53,13 @@ def predict_torque_ramp(arm, command, state, sheet, servo, physics, samples, per
         state: (2 n,) [q; v].
         sheet: (2,) deflection of the leaf and its rate.
         servo: gains and limits from `servo_gains_and_limits`.
-        physics: `SlavePlant.physics_of_plant`.
+        physics: `SlavePlant.compiled_constants`.
         period: period of the servo [s].
-        line: (3 n,) output: torque now [N m], its rate [N m/s], torque at the last predicted
-            sample [N m].
+        ramp: (3 n,) output: torque now [N m], its rate [N m/s], last predicted torque [N m].
     """
     n = command.shape[0]
     kp, kv, speed_limit, effort_limit = servo
-    now, rate, torque = line[:n], line[n : 2 * n], line[2 * n :]
+    now, rate, torque = ramp[:n], ramp[n : 2 * n], ramp[2 * n :]
     x, half, xdot = np.empty(2 * n + 2), np.empty(2 * n + 2), np.empty(2 * n + 2)
     predicted, wrench_W, no_wrench = np.empty(2 * n), np.empty(6), np.zeros(6)
     assemble_plant_state_into(state, sheet, x)
@@ -84,7 +83,7 @@ def predict_torque_ramp(arm, command, state, sheet, servo, physics, samples, per
         for i in range(2 * n + 2):
             x[i] += period * xdot[i]
     for i in range(n):
-        # `away` is half the rise of the line; both ends are clipped to the torque limits.
+        # `away` is half the rise of the ramp; both ends are clipped to the torque limits.
         mean, away = now[i] / samples, 6.0 * rate[i] / samples**2
         start = min(max(mean - away, -effort_limit[i]), effort_limit[i])
         end = min(max(mean + away, -effort_limit[i]), effort_limit[i])
@@ -92,10 +91,10 @@ def predict_torque_ramp(arm, command, state, sheet, servo, physics, samples, per
 
 
 @njit(cache=True, omits_reference_counting=True)
-def _evaluate_torque_ramp_into(time, line, torque):
+def _evaluate_torque_ramp_into(time, ramp, torque):
     n = torque.shape[0]
     for i in range(n):
-        torque[i] = line[i] + (time - line[-1]) * line[n + i]
+        torque[i] = ramp[i] + (time - ramp[-1]) * ramp[n + i]
 
 
 class SampledServo(LeafSystem):
@@ -115,14 +114,14 @@ class SampledServo(LeafSystem):
         n = self._n = arm.num_joints
         self._arm = arm.table
         servo, scratch = servo_gains_and_limits(arm, config), np.zeros(3 * n)
-        self._constants = servo, slave.physics_of_plant, samples, period, scratch
+        self._constants = servo, slave.compiled_constants, samples, period, scratch
         self._command = self.DeclareVectorInputPort("joint_command", n)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
         self._at_rest, self._sheet = np.zeros(2), None
-        if slave.compiled_sheet_instance is not None:
+        if slave.leaf_instance_in_compiled_law is not None:
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
         holding = holding_torque(arm, slave.start)
-        # The line that `predict_torque_ramp` writes, then its start time.
+        # The ramp that `predict_torque_ramp` writes, then its start time.
         self.DeclareDiscreteState(np.concatenate([holding, np.zeros(n), holding, [0.0]]))
         when = {self.time_ticket(), self.xd_ticket()}
         torque, rate = weak_callback(self._calc_torque), weak_callback(self._calc_torque_rate)
@@ -131,12 +130,12 @@ class SampledServo(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(samples * period, 0.0, self._predict_torque_ramp)
 
     def _calc_torque(self, context: Context, output: BasicVector) -> None:
-        line = context.get_discrete_state_vector().value()
-        _evaluate_torque_ramp_into(context.get_time(), line, output.get_mutable_value())
+        ramp = context.get_discrete_state_vector().value()
+        _evaluate_torque_ramp_into(context.get_time(), ramp, output.get_mutable_value())
 
     def _calc_torque_rate(self, context: Context, output: BasicVector) -> None:
-        line = context.get_discrete_state_vector().value()
-        output.SetFromVector(line[self._n : 2 * self._n])
+        ramp = context.get_discrete_state_vector().value()
+        output.SetFromVector(ramp[self._n : 2 * self._n])
 
     def _predict_torque_ramp(self, context: Context, discrete_state: DiscreteValues) -> None:
         following = discrete_state.get_mutable_value(0)

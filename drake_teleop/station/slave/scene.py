@@ -17,25 +17,27 @@ from drake_teleop.station.slave.models import ParseScene
 from drake_teleop.station.slave.surroundings import supports_pose_conversion
 
 _RESERVED_BODY_NAMES = {"tool", "leaf", "block", "sensor", "tip", "stylus"}
-_TOOL_BALL_MESH_EDGE_M = 0.005  # m, edge length of the mesh of the tool's ball
+_TOOL_MESH_EDGE_LENGTH_M = 0.005  # m, edge length of the mesh of the tool's ball
 
 
 @settings
 @dataclass
 class Scene(Environment):
-    """Surroundings from a file, with pose, and point or hydroelastic contact."""
+    """Surroundings from a file, with point or hydroelastic contact."""
 
     file: str = plain(
-        "door.sdf", ".sdf, .urdf, .dmd.yaml, from the scenario's folder, or door.sdf", is_path=True
+        "door.sdf", "SDF, URDF, .dmd.yaml in scenario's folder; built in: door.sdf", is_path=True
     )
     position: list[float] = quantity([0.0, 0.0, 0.0], "m", -3.0, 3.0, "the file's position in W")
     rotation: list[float] = quantity([0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch, yaw in W")
-    fixed: bool = plain(True, "weld free roots at their poses in the file; false: they float")
+    fixed: bool = plain(True, "weld free bodies at their poses in the file; false: they float")
     contact: str = choice(
-        "point", ("point", "hydroelastic"), "Drake's model; non-hydroelastic shapes use point"
+        "point", ("point", "hydroelastic"), "contact model; shapes without hydroelastic data: point"
     )
-    tool_modulus: float = quantity(1e7, "Pa", 1e4, 1e11, "hydroelastic modulus of the tool (E)")
-    slip_speed: float = quantity(1e-3, "m/s", 1e-6, 1.0, "sliding speed of full friction (E)")
+    tool_modulus: float = quantity(1e7, "Pa", 1e4, 1e11, "hydroelastic tool modulus (estimate)")
+    slip_speed: float = quantity(
+        1e-3, "m/s", 1e-6, 1.0, "sliding speed from which friction has its full value (estimate)"
+    )
 
     @property
     def path(self) -> Path:
@@ -104,7 +106,7 @@ class Scene(Environment):
         for shape in own:
             material = geometry.ProximityProperties(inspector.GetProximityProperties(shape))
             if not has_hydroelastic_properties(material):
-                edge, modulus = _TOOL_BALL_MESH_EDGE_M, self.tool_modulus
+                edge, modulus = _TOOL_MESH_EDGE_LENGTH_M, self.tool_modulus
                 geometry.AddCompliantHydroelasticProperties(edge, modulus, material)
                 replace = geometry.RoleAssign.kReplace
                 scene_graph.AssignRole(plant.get_source_id(), shape, material, replace)

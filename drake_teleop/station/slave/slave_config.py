@@ -1,4 +1,4 @@
-"""Settings of the slave in a scenario: arm, base pose, start, tool and payload."""
+"""Settings of the slave: arm, base pose, start, tool and payload."""
 
 import math
 from dataclasses import dataclass, field
@@ -29,7 +29,7 @@ class Ball:
     """Ball as collision shape of the tool."""
 
     radius: float = quantity(0.012, "m", 1e-4, 1.0, "radius")
-    position: list[float] = quantity([0.0, 0.0, 0.1], "m", -2.0, 2.0, "centre of the shape, in S")
+    position: list[float] = quantity([0.0, 0.0, 0.1], "m", -2.0, 2.0, "p_S of the centre")
 
     @property
     def shape(self) -> Shape:
@@ -46,7 +46,7 @@ class Block:
     """Box as collision shape of the tool."""
 
     edges: list[float] = quantity([0.04, 0.04, 0.04], "m", 1e-4, 2.0, "lengths along x, y, z")
-    position: list[float] = quantity([0.0, 0.0, 0.1], "m", -2.0, 2.0, "centre of the shape, in S")
+    position: list[float] = quantity([0.0, 0.0, 0.1], "m", -2.0, 2.0, "p_S of the centre")
     rpy: list[float] = quantity([0.0, 0.0, 0.0], "rad", -6.3, 6.3, "roll, pitch, yaw in S")
 
     @property
@@ -66,14 +66,15 @@ class Block:
 @settings
 @dataclass
 class Tool:
-    """Tool on the sensor: by default the paper's; `model` or `mass` replaces it."""
+    """Tool on the sensor: by default that of the paper, otherwise by `model` or `mass`."""
 
-    model: str = plain("", "file of a tool; its root link is welded to S", is_path=True)
-    mass: float = quantity(0.0, "kg", 0.0, 100.0, "mass of a tool without a file")
+    model: str = plain("", "model file of the tool; its root is at S", is_path=True)
+    mass: float = quantity(0.0, "kg", 0.0, 100.0, "mass of a tool without a model")
     com: list[float] = quantity([0.0, 0.0, 0.05], "m", -1.0, 1.0, "centre of mass, p_SoBcm_S")
     inertia: list[float] = quantity(
-        [0.0] * 6, "kg m^2", -10.0, 10.0, "about com: xx, xy, xz, yy, yz, zz; zeros: steel ball"
-    )
+        [0.0] * 6, "kg m^2", -10.0, 10.0,
+        "about com, in S: xx, xy, xz, yy, yz, zz; zeros: those of a steel ball with this mass",
+    )  # fmt: skip
     shapes: list[Ball | Block] = plain([], "collision shapes: !Ball, !Block")
 
     @property
@@ -97,7 +98,7 @@ class Tool:
 @settings
 @dataclass
 class Payload:
-    """Payload: a ball of steel, welded to the tool, without a collision shape; part of the load."""
+    """Payload: a steel ball, welded to the tool, without collision shape; part of the load."""
 
     mass: float = quantity(0.0, "kg", 0.0, 10.0, "mass of the payload; 0: none")
     com: list[float] = quantity([0.0, 0.0, 0.15], "m", -0.5, 0.5, "centre of mass, p_SoBcm_S")
@@ -109,46 +110,46 @@ class Slave:
     """Slave: the arm, by default the paper's, with its tool."""
 
     position: list[float] = quantity(
-        [0.55, 0.0, 0.45], "m", -5.0, 5.0, "p_WS at the start, with z_S down; not used with home"
+        [0.55, 0.0, 0.45], "m", -5.0, 5.0, "p_WS at the start, with z_S down; unused if home is set"
     )
     payload: Payload = field(default_factory=Payload)
     inverse_kinematics: str = choice(
         AUTOMATIC_IK_METHOD,
         (AUTOMATIC_IK_METHOD,),
-        "closed_form: for arms with the geometry of the RX90; numeric: for any arm, within joint"
-        " speeds; automatic: closed_form where possible",
+        "method: closed_form for arms with the geometry of the RX90, numeric for any arm, within"
+        " joint speeds; automatic: closed_form where possible",
         IK_METHODS,
     )
     model: str = plain(
-        "", "URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder; default: RX90", is_path=True
+        "", "URDF, SDF, MJCF or .dmd.yaml in the scenario's folder; default: RX90", is_path=True
     )
     package_paths: list[str] = plain(
-        [], "folders for package:// addresses, from the scenario's folder", is_path=True
+        [], "folders of package:// addresses, relative to the scenario's folder", is_path=True
     )
     base_pose: list[float] = quantity(
-        [0.0] * 6, "m, rad", -10.0, 10.0, "X_WBase of the arm: position; roll, pitch, yaw"
+        [0.0] * 6, "m, rad", -10.0, 10.0, "base in W: x, y, z, and roll, pitch, yaw"
     )
     sensor_frame: str = plain(
-        "sensor", "frame or link of the model at which the sensor measures: S; z_S towards the tool"
+        "sensor", "name of the model's frame or link where the sensor measures; z to the tool"
     )
     home: list[float] = quantity(
-        [], "rad, m", -1e4, 1e4, "joint positions at the start; default: computed from position"
+        [], "rad, m", -1e4, 1e4, "joint positions at the start; default: so that S is at position"
     )
     hold: dict[str, float] = quantity(
         {}, "rad, m", -1e4, 1e4, "positions of joints that are fixed, such as {torso_lift: 0.2}"
     )
     torque_limits: dict[str, float] = quantity(
-        {}, "N m, N", 1e-6, math.inf, "limits by joint instead of the model's; .inf: no limit"
+        {}, "N m, N", 1e-6, math.inf, "torque limits by joint, not the model's; .inf: unlimited"
     )
     friction: list[float] = quantity(
-        [], "N m, N", 0.0, 1e6, "dry friction, one for all joints or one each; control ignores it"
+        [], "N m, N", 0.0, 1e6, "dry friction of all joints or one each; not compensated by control"
     )
     tool: Tool | None = field(
         default_factory=Tool,
         metadata={"doc": "tool on the sensor; null: the model's bodies beyond its sensor frame"},
     )
     tip: list[float] = quantity(
-        [], "m", -2.0, 2.0, "p_STip; default: the frame `tip` or the end of the shapes along z_S"
+        [], "m", -2.0, 2.0, "p_S of the tip; default: tool's frame `tip`, or farthest end in z_S"
     )
 
     @property
@@ -176,7 +177,7 @@ class Slave:
 
 
 def AddPayload(plant: MultibodyPlant, holder: Frame, payload: Payload) -> None:
-    """Weld the payload, if it has mass, to `holder`, a frame that coincides with S."""
+    """Weld a payload with mass to `holder`, a frame that coincides with S."""
     if payload.mass == 0.0:
         return
     inertia = SpatialInertia.SolidSphereWithMass(payload.mass, steel_ball_radius(payload.mass))
@@ -185,8 +186,8 @@ def AddPayload(plant: MultibodyPlant, holder: Frame, payload: Payload) -> None:
     plant.AddJoint(weld)
 
 
-def tip_of_tool_shapes(tool: Tool) -> list[float] | None:
-    """Return p_STip [m]: end of the farthest shape along z_S, at its centre's x and y; or None."""
+def p_STip_of_shapes(tool: Tool) -> list[float] | None:
+    """Return p_STip [m], the farthest shape's end along z_S; None without shapes."""
     halves = [x.radius if isinstance(x, Ball) else x.half_extent_along_z for x in tool.shapes]
     ends = [np.add(x.position, [0.0, 0.0, h]) for x, h in zip(tool.shapes, halves, strict=True)]
     return max(ends, key=lambda end: float(end[2])).tolist() if ends else None

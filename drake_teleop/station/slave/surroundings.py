@@ -20,12 +20,12 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.station.environment import moving_bodies, point_contact
 from drake_teleop.station.environment.environment import Environment, ToolShapes
 
-_IDENTITY_POSE_TOLERANCE = 1e-12  # rounding of frames
+_IDENTITY_TOLERANCE_RAD_OR_M = 1e-12  # rounding of frames
 _MIN_MASS_MATRIX_EIGENVALUE_SI = 1e-12  # kg or kg m^2, smallest valid eigenvalue
 
 
 class AddedEnvironment(NamedTuple):
-    """Model instances of an environment; `leaf_instance` is that of its `moving_part`, or None."""
+    """Model instances of an environment; `leaf_instance` has its sprung body, if any."""
 
     instances: Collection[tree.ModelInstanceIndex]
     leaf_instance: tree.ModelInstanceIndex | None
@@ -35,20 +35,20 @@ class ToolContactModel(NamedTuple):
     """Model of the contact between tool and environment.
 
     Attributes:
-        compiled_pairs: (k, 28) `ShapePairs.compiled_pairs`; empty if `drake_contact_reason` is set.
-        monitored_pairs: (l, 40) `ShapePairs.monitored_pairs`, computed by Drake at close range.
-        joint_table: (m, 21) from `MakeJointTableAndRowBodies`, of the boxes in `compiled_pairs`.
+        compiled_pairs: (k, 28) spheres and boxes (`ShapePairs`); empty with `drake_contact_reason`.
+        monitored_pairs: (l, 40) other shapes (`ShapePairs`), computed by Drake at close range.
+        joint_table: (m, 21) joints of moving boxes, from `MakeJointTableAndRowBodies`.
         plant_state_size: size of the plant's state, 0 without joints.
         drake_contact_reason: why Drake's contact results replace the compiled law, or empty.
         tool_bodies, tool_shapes: indices of the tool's bodies, identifiers of their shapes.
         leaf_parameters: (4,) mass [kg], stiffness [N/m], damping [N s/m], gravity [m/s^2].
-        leaf_instance: model instance of the leaf, or of another `moving_part`; None without one.
+        leaf_instance: model instance of the leaf or another `moving_part`, or None.
         moving_bodies: indices of other moving bodies, by name.
     """
 
     compiled_pairs: Array = np.zeros((0, point_contact.NUM_PAIR_COLUMNS))
     monitored_pairs: Array = np.zeros((0, point_contact.NUM_MONITORED_COLUMNS))
-    joint_table: Array = np.zeros((0, moving_bodies.NUM_JOINT_COLUMNS))
+    joint_table: Array = np.zeros((0, moving_bodies.NUM_JOINT_TABLE_COLUMNS))
     plant_state_size: int = 0
     drake_contact_reason: str = ""
     tool_bodies: frozenset[int] = frozenset()
@@ -78,8 +78,8 @@ def MakeToolContactModel(
 ) -> ToolContactModel:
     """Return the contact model of tool and environment, in a finalized plant.
 
-    `scene_graph` contains the shapes of tool and environment only. A DrakeTeleopError is raised for
-    hydroelastic contact without hydroelastic shapes, or a moving body without mass.
+    `scene_graph` contains only shapes of tool and environment. A DrakeTeleopError is raised for
+    hydroelastic contact without hydroelastic shapes, or moving bodies without mass.
     """
     environment.PrepareContact(plant, scene_graph, tool)
     shapes, context = ToolShapes(plant, scene_graph, tool), plant.CreateDefaultContext()
@@ -105,7 +105,7 @@ def MakeToolContactModel(
     if environment.hydroelastic:
         return contact._replace(drake_contact_reason="contact is hydroelastic")
     if contact.leaf_instance is not None and len(environment.parts) > 1:
-        return contact._replace(drake_contact_reason="the environment has more than a sheet spring")
+        return contact._replace(drake_contact_reason="the sheet spring is not the only object")
     joints, order = contact.joint_table, list[int]()
     if contact.moving_bodies:
         moving = contact.moving_bodies.values()
@@ -114,7 +114,7 @@ def MakeToolContactModel(
     for index, own in shapes.items():
         frame = plant.get_body(index).body_frame()
         X_SBody = plant.CalcRelativeTransform(context, sensor_frame, frame)
-        is_identity = X_SBody.IsNearlyIdentity(_IDENTITY_POSE_TOLERANCE)
+        is_identity = X_SBody.IsNearlyIdentity(_IDENTITY_TOLERANCE_RAD_OR_M)
         from_S |= dict.fromkeys(own, RigidTransform() if is_identity else X_SBody)
     inspector, slip_speed = scene_graph.model_inspector(), environment.slip_speed
     touched = [*added.instances, tree.world_model_instance()]  # a link "world" may have shapes
@@ -150,7 +150,7 @@ def MovingBodiesExceptLeaf(
 
 
 def supports_pose_conversion(joint: tree.Joint) -> bool:
-    """Return whether `joint_positions_of_pose` supports the type of the joint."""
+    """Return whether `joint_positions_of_pose` supports the joint."""
     kinds = (tree.RevoluteJoint, tree.PrismaticJoint, tree.QuaternionFloatingJoint)
     return joint.num_positions() == 0 or isinstance(joint, kinds)
 

@@ -19,7 +19,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.model import model_references, model_repair
 from drake_teleop.station.slave.model.model_numbers import MAX_MODEL_VALUE_SI, parse_numbers
 
-_SIZE_VALUE_COUNTS_BY_SHAPE = {
+_NUM_SIZE_VALUES_OF_SHAPE = {
     "box": {"size": 3},
     "sphere": {"radius": 1},
     "cylinder": {"radius": 1, "length": 1},
@@ -35,9 +35,9 @@ _STL_TRIANGLE_DTYPE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3))
 def remove_unusable_shapes(model: model_repair.ModelRepair) -> None:
     """Remove shapes that Drake cannot read, or all shapes if the plant has no SceneGraph.
 
-    Relative mesh addresses become absolute. STL meshes are converted to convex hulls, because Drake
-    does not read STL. Removed shapes of links that keep none are reported, removed collision shapes
-    also of tools, of scenes, and of links that keep other collision shapes.
+    Relative mesh addresses become absolute. STL meshes, which Drake does not read, become convex
+    hulls. Reported are removed shapes of links that keep none, and removed collision shapes of
+    tools, scenes and links that keep other ones.
     """
     lost, purpose = dict[str, list[str]](), model.purpose
     for link in model.root.iter("link"):
@@ -65,9 +65,9 @@ def remove_unusable_shapes(model: model_repair.ModelRepair) -> None:
 def _unusable_shape_reason(shape: ElementTree.Element) -> str | None:
     inner = shape.find("geometry/*")
     kind = "" if inner is None else inner.tag.removeprefix("drake:")
-    if inner is None or kind not in _SIZE_VALUE_COUNTS_BY_SHAPE:
+    if inner is None or kind not in _NUM_SIZE_VALUES_OF_SHAPE:
         return f"{kind or 'empty'} shapes cannot be read"
-    sizes = {"radii": 3} if inner.find("radii") is not None else _SIZE_VALUE_COUNTS_BY_SHAPE[kind]
+    sizes = {"radii": 3} if inner.find("radii") is not None else _NUM_SIZE_VALUES_OF_SHAPE[kind]
     for name, count in sizes.items():
         values = parse_numbers(inner.get(name) or inner.findtext(name))
         if len(values) != count or not all(0.0 < value <= MAX_MODEL_VALUE_SI for value in values):
@@ -148,9 +148,9 @@ def check_triangle_vertices(triangles: Triangles) -> Triangles:
     if not faces.size:
         raise ValueError("a mesh has no triangles")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise ValueError("a mesh has triangles with missing vertices")
+        raise ValueError("triangles of a mesh have missing vertices")
     if not np.isfinite(vertices).all():
-        raise ValueError("a mesh has vertices that are not finite")
+        raise ValueError("vertices of a mesh are not finite")
     return triangles
 
 
@@ -208,7 +208,7 @@ def _read_obj(data: bytes) -> Triangles:
 def _read_msh(data: bytes) -> Triangles:
     n, normals, texture, count = (int(k) for k in np.frombuffer(data, "<i4", 4))
     if min(n, normals, texture, count) < 0:
-        raise ValueError("a mesh file has a negative count")
+        raise ValueError("a mesh file has a negative number of elements")
     vertices = np.frombuffer(data, "<f4", 3 * n, 16).reshape(-1, 3)
     start = 16 + 4 * (3 * n + 3 * normals + 2 * texture)
     faces = np.frombuffer(data, "<i4", 3 * count, start).reshape(-1, 3)

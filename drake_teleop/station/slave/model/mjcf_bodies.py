@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.slave.model import mjcf_meshes, model_numbers
 from drake_teleop.station.slave.model.mjcf_elements import (
-    MIN_DIRECTION_VECTOR_LENGTH,
+    MIN_DIRECTION_LENGTH,
     Attributes,
     Mjcf,
     smallest_rotation_of_z_to,
@@ -60,7 +60,7 @@ class Geom:
 
 @dataclass(eq=False)
 class Body:
-    """Body with pose X_PB in its parent; `generator_tags` are unsupported tags that add bodies."""
+    """Body with pose X_PB in its parent; `generator_tags`: unsupported tags such as replicate."""
 
     name: str
     X_PB: RigidTransform
@@ -131,8 +131,8 @@ class BodyReader:
         given.label = f"joint {name}"
         kind = "free" if tag == "freejoint" else given.get("type", "hinge")
         axis = given.vector("axis", (0.0, 0.0, 1.0))
-        if np.linalg.norm(axis) < MIN_DIRECTION_VECTOR_LENGTH:
-            self._mjcf.model.add_fault(f"joint {name}: its axis is 0")
+        if np.linalg.norm(axis) < MIN_DIRECTION_LENGTH:
+            self._mjcf.model.add_fault(f"joint {name}: axis has length 0; set a direction")
             axis = np.array([0.0, 0.0, 1.0])
         limits = given.read_range("range", "limited", autolimits=self._mjcf.autolimits)
         ref = given.number("ref", 0.0)
@@ -151,7 +151,7 @@ class BodyReader:
             X_FG = RigidTransform(smallest_rotation_of_z_to(ends[0] - ends[1]), ends.mean(axis=0))
             half = float(np.linalg.norm(ends[0] - ends[1])) / 2
             size = [size[0], half, 0.0] if kind in _ROUND_ROD_SHAPES else [size[0], size[0], half]
-        found = self.meshes.find(name) if name else None
+        found = self.meshes.find_mesh_or_fault(name) if name else None
         mesh, fault = (None, found) if isinstance(found, str) else (found, "")
         if kind in ("hfield", "sdf") or (kind == "mesh" and not name):
             fault = f"shapes of type {kind} are not supported"
@@ -168,7 +168,7 @@ class BodyReader:
             self.lost.setdefault(fault, []).append((body, given))
             return
         if given.get("shellinertia") == "true":
-            self._mjcf.model.add_assumption("solid instead of hollow shapes of", body.name)
+            self._mjcf.model.add_assumption("solid shapes instead of hollow ones, of", body.name)
         body.geoms.append(Geom(kind, X_BF @ X_FG, size, given, mesh))
 
     def _read_inertial(self, body: Body, given: Attributes) -> mjcf_meshes.MassProperties:
@@ -217,7 +217,7 @@ class BodyReader:
 
 
 class MjcfWriter:
-    """Writer of MJCF text; bodies at the top of a tool get free joints.
+    """Writer of MJCF text; root bodies of a tool get free joints, or Drake would fix them.
 
     Contact meshes become convex hulls, as in MuJoCo, except in a scene.
     """
@@ -232,8 +232,8 @@ class MjcfWriter:
         materials = [each for each in mjcf.elements_in("asset") if each.tag == "material"]
         self._colours = {e.get("name"): read(e, "", "material").get("rgba") for e in materials}
 
-    def write(self, world: Body, efforts: dict[str, float]) -> str:
-        """Return the MJCF text of a world body; joints in `efforts` get motors of these limits."""
+    def write(self, world: Body, effort_limits: dict[str, float]) -> str:
+        """Return the MJCF text of a world body; joints in `effort_limits` get motors."""
         self._write_joints_geoms_and_children(SubElement(self._root, "worldbody"), world)
         names = {body.name for body in world.with_descendants()}
         contact = SubElement(self._root, "contact")
@@ -242,7 +242,7 @@ class MjcfWriter:
             if each.tag == "exclude" and names.issuperset(ends.values()):
                 SubElement(contact, "exclude", ends)
         actuators = SubElement(self._root, "actuator")
-        for name, effort in efforts.items():
+        for name, effort in effort_limits.items():
             motor = SubElement(actuators, "motor", name=name, joint=name)
             if 0.0 < effort < float("inf"):
                 motor.set("ctrllimited", "true")
@@ -276,7 +276,7 @@ class MjcfWriter:
             values |= {"limited": "true", "range": _format_numbers(joint.limits)}
         damping = joint.attributes.number("damping", 0.0)
         if damping < 0.0:
-            self._model.add_assumption("damping 0 in place of a negative one for", joint.name)
+            self._model.add_assumption("damping is 0, not negative, of joint", joint.name)
         values["damping"] = repr(max(damping, 0.0))
         values["armature"] = repr(max(joint.attributes.number("armature", 0.0), 0.0))
         SubElement(element, "joint", values)

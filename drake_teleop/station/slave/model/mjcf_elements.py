@@ -18,7 +18,7 @@ from drake_teleop.station.slave.model.model_references import read_xml
 from drake_teleop.station.slave.model.model_repair import ModelRepair
 
 _MAX_ELEMENT_NESTING_DEPTH = 150  # largest depth of nested elements
-MIN_DIRECTION_VECTOR_LENGTH = 1e-9
+MIN_DIRECTION_LENGTH = 1e-9
 """Shortest vector that has a direction."""
 _ORIENTATION_ATTRIBUTES = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 # A shorter list is completed by the last numbers of the default.
@@ -29,7 +29,7 @@ _MAIN_DEFAULT_CLASS = "main"  # name of the class at the top
 
 
 class Attributes(dict[str, str]):
-    """Attributes of one XML element; `label` names it in faults, which are added to `model`."""
+    """Attributes of one XML element, which faults in `model` call `label`."""
 
     def __init__(self, values: dict[str, str], label: str, model: ModelRepair) -> None:
         super().__init__(values)
@@ -38,7 +38,7 @@ class Attributes(dict[str, str]):
     def numbers(
         self, name: str, default: tuple[float, ...], max_magnitude: float = math.inf
     ) -> list[float]:
-        """Return the numbers in attribute `name`; last ones of `default` supply missing ones."""
+        """Return numbers of attribute `name`, filled from `default`; report above max_magnitude."""
         values, fault = parse_numbers(self.get(name)), ""
         if not all(map(math.isfinite, values)):
             fault = "is not a list of numbers"
@@ -69,15 +69,15 @@ class Attributes(dict[str, str]):
     def read_range(self, name: str, flag: str, *, autolimits: bool) -> tuple[float, float] | None:
         """Return the limits (lower, upper) in attribute `name`, or None if they are switched off.
 
-        Attribute `flag` switches them: true, false, or auto (the default). With auto, limits of
-        nonzero width apply if `autolimits` of the compiler element is true.
+        Attribute `flag` switches them: true, false, or auto (the default): limits apply if they
+        differ and `autolimits` of the compiler element is true.
         """
         lower, upper = self.numbers(name, (0.0, 0.0))
         limited = self.get(flag, "auto")
         if limited == "false" or (limited == "auto" and not (autolimits and lower != upper)):
             return None
         if lower > upper:
-            self._model.add_fault(f"{self.label}: {name} from {lower:g} to {upper:g} is empty")
+            self._model.add_fault(f"{self.label}: swap the ends of {name}, {lower:g} to {upper:g}")
         return lower, upper
 
 
@@ -103,7 +103,7 @@ class Mjcf:
             self._add_defaults(element, _MAIN_DEFAULT_CLASS, self._defaults[_MAIN_DEFAULT_CLASS])
 
     def find_file(self, element: Element, name: str, folder: str) -> Path | None:
-        """Return `folder`/`name` beside the main file or that of `element`; None if missing."""
+        """Return `folder`/`name` beside the main file or the file of `element`, or None."""
         places = [self.model.path.resolve().parent, self._folders.get(element)]
         find = self.model.files.find_file
         found = (find(name, place / folder) for place in places if place)
@@ -121,7 +121,7 @@ class Mjcf:
         """Return an element's attributes, with defaults of its class, otherwise of `childclass`."""
         name = element.get("class") or childclass or _MAIN_DEFAULT_CLASS
         if name not in self._defaults:
-            self.model.add_fault(f"{label}: there is no class {name}")
+            self.model.add_fault(f"{label}: the default class {name} is undefined")
             name = _MAIN_DEFAULT_CLASS
         kind = "actuator" if element.tag in _ACTUATOR_TAGS else element.tag
         defaults = self._defaults[name].get(kind, {})
@@ -151,7 +151,7 @@ class Mjcf:
         if "xyaxes" in given:
             axes = given.vector("xyaxes", (1.0, 0.0, 0.0, 0.0, 1.0, 0.0))
             z = np.cross(axes[:3], axes[3:])
-            if np.linalg.norm(z) < MIN_DIRECTION_VECTOR_LENGTH:
+            if np.linalg.norm(z) < MIN_DIRECTION_LENGTH:
                 self.model.add_fault(f"{given.label}: its xyaxes are parallel")
                 return RotationMatrix()
             columns = np.column_stack([axes[:3], np.cross(z, axes[:3]), z])
@@ -173,7 +173,7 @@ class Mjcf:
             name = child.get("file", "")
             file = self.find_file(child, name, "")
             if file is None:
-                self.model.add_fault(f"the included file {name!r} was not found")
+                self.model.add_fault(f"the included file {name!r} was not found; correct its path")
             elif file.resolve() in seen:
                 self.model.add_fault(f"{name} is included twice")
             else:

@@ -69,7 +69,7 @@ def unit_density_properties_of_primitive(kind: str, size: list[float]) -> MassPr
 
 
 def unit_density_properties_of_mesh(mesh: Mesh) -> MassProperties:
-    """Return the mass properties of a mesh of density 1 kg/m^3, by MuJoCo's rule `mesh.inertia`.
+    """Return mass properties of a mesh of density 1 kg/m^3, by MuJoCo's rule `mesh.inertia`.
 
     The rule "legacy" adds the absolute volumes of tetrahedra between the centre and each triangle.
     """
@@ -94,7 +94,7 @@ def unit_density_properties_of_mesh(mesh: Mesh) -> MassProperties:
 def fit_shape_to_mesh(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTransform, list[float]]:
     """Return pose X_GP in mesh axes G, and size, of the primitive P that MuJoCo fits to a mesh.
 
-    The inertia of the mesh determines the size, or with `by_box` its bounding box (`fitaabb`).
+    The size fits the inertia of the mesh, or with `by_box` its bounding box (`fitaabb`).
     """
     mass, centre, inertia = unit_density_properties_of_mesh(mesh)
     moments, axes = np.linalg.eigh(inertia)
@@ -119,22 +119,22 @@ def fit_shape_to_mesh(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTran
 
 
 def _mass_properties_of_simplices(
-    corners: Array, weight: Array, centre: Array, num_vertices: int = 3
+    corners: Array, masses: Array, centre: Array, num_vertices: int = 3
 ) -> MassProperties:
-    """Return mass properties of triangles (3 vertices), or tetrahedra (4) with tips at `centre`.
+    """Return mass properties of a shell (triangles), or solid of 4-vertex tetrahedra to `centre`.
 
-    `corners` (m, 3, 3) are relative to `centre`; `weight` (m,) are their masses.
+    `corners` (m, 3, 3) are relative to `centre`; `masses` (m,) belong to the parts.
     """
     total = corners.sum(axis=1)
     second = np.einsum("nai,naj->nij", corners, corners) + np.einsum("ni,nj->nij", total, total)
-    products = np.einsum("n,nij->ij", weight, second) / (num_vertices * (num_vertices + 1))
+    products = np.einsum("n,nij->ij", masses, second) / (num_vertices * (num_vertices + 1))
     inertia = np.trace(products) * np.eye(3) - products
-    return MassProperties(float(weight.sum()), centre, inertia)
+    return MassProperties(float(masses.sum()), centre, inertia)
 
 
-def _tetrahedron_volumes(corners: Array, mode: str) -> Array:
+def _tetrahedron_volumes(corners: Array, inertia_rule: str) -> Array:
     volume = np.linalg.det(corners) / 6
-    return np.abs(volume) if mode == "legacy" else volume
+    return np.abs(volume) if inertia_rule == "legacy" else volume
 
 
 class Mesh:
@@ -194,7 +194,7 @@ class MeshLibrary:
                 mesh = Mesh(mjcf, attributes, file)
                 self._meshes[mesh.name] = fault or mesh
 
-    def find(self, name: str) -> Mesh | str:
+    def find_mesh_or_fault(self, name: str) -> Mesh | str:
         """Return the mesh with this name, or a text about its fault."""
         mesh = self._meshes.get(name, model_references.MESHES_NOT_FOUND_FAULT)
         if isinstance(mesh, Mesh) and not mesh.is_readable_by_drake:

@@ -1,7 +1,7 @@
 """Repair of an MJCF text, so that Drake reads the arm in it as MuJoCo does.
 
 The new text has poses as quaternions, angles in rad, masses as explicit inertias, one joint per
-body, and only the bodies that the arm carries.
+body, and only bodies that the arm carries.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from drake_teleop.station.slave.model.mjcf_meshes import ZERO_MASS_PROPERTIES
 
 _DRAKE_GRAVITY_M_S2, _GRAVITY_TOLERANCE_M_S2 = (0.0, 0.0, -9.81), 0.02  # [m/s^2]
 # Dynamics whose output has no range.
-_DYNTYPES_WITH_UNBOUNDED_OUTPUT = ("integrator", "muscle", "user", "dcmotor")
+_ACTUATOR_DYNTYPES_WITHOUT_LIMIT = ("integrator", "muscle", "user", "dcmotor")
 
 
 def repair_mjcf(model: model_repair.ModelRepair) -> None:
@@ -32,11 +32,11 @@ def repair_mjcf(model: model_repair.ModelRepair) -> None:
     purpose, mjcf = model.purpose, Mjcf(model)
     reader = BodyReader(mjcf)
     if not mjcf.root.get("model"):
-        model.add_assumption("the model is named after its file:", model.path.stem)
+        model.add_assumption("the model has no name and gets that of its file:", model.path.stem)
     for option in mjcf.root.findall("option"):
         gravity = Attributes(option.attrib, "option", model).vector("gravity", _DRAKE_GRAVITY_M_S2)
         if np.abs(np.subtract(gravity, _DRAKE_GRAVITY_M_S2)).max() > _GRAVITY_TOLERANCE_M_S2:
-            model.add_assumption("gravity of 9.81 m/s^2 instead of", option.get("gravity", ""))
+            model.add_assumption("gravity is 9.81 m/s^2, not the file's", option.get("gravity", ""))
     is_complete = purpose.is_scene or purpose.is_in_directives
     if is_complete or not purpose.sensor_name:
         world = _split_into_one_joint_bodies(reader.read_world())
@@ -54,9 +54,9 @@ def repair_mjcf(model: model_repair.ModelRepair) -> None:
         _check_joint_couplings(world, chain, moving, mjcf)
     if purpose.is_tool and world.geoms:
         world.geoms.clear()
-        what = "left out, because the tool does not carry them: shapes of"
+        what = "shapes are left out, because the tool does not carry them, of"
         model.add_assumption(what, "the world")
-    _check_names_and_generator_tags(bodies, model)
+    _report_equal_names_and_generators(bodies, model)
     _set_mass_properties(world, reader, set(moving), mjcf)
     with_motor = [joint for joint in moving if joint.kind in ("hinge", "slide")]
     efforts = {} if purpose.is_scene else _effort_limits(mjcf, with_motor)
@@ -89,7 +89,7 @@ def _read_world_with_only_arm(mjcf: Mjcf, reader: BodyReader) -> Body:
     world = reader.read_world()
     names_of_others = [other.get("name") or "a body without name" for _, other in others]
     for name in (*names_of_others, *world.generator_tags):
-        model.add_assumption("left out, because the arm does not carry it:", name)
+        model.add_assumption("elements beside the arm are left out:", name)
     world.generator_tags.clear()
     world = _split_into_one_joint_bodies(world)
     if kind == "site":
@@ -125,8 +125,8 @@ def _split_into_one_joint_bodies(body: Body) -> Body:
 def _insert_sensor_frame_at_site(body: Body, site: str, *, is_force_sensor_site: bool) -> None:
     """Add a massless body as sensor frame, at the pose of a site on a descendant of `body`.
 
-    If a `force` or `torque` sensor measures at the site (`is_force_sensor_site`), the new body
-    becomes the parent of the site's body, otherwise its child.
+    If a force or torque sensor is at the site (`is_force_sensor_site`), the new body becomes the
+    parent of the site's body, otherwise its child.
     """
     for k, child in enumerate(body.children):
         X_BS = child.sites.pop(site, None)
@@ -144,7 +144,7 @@ def _insert_sensor_frame_at_site(body: Body, site: str, *, is_force_sensor_site:
 def _weld_other_joints_and_list_moving(
     world: Body, chain: list[Body], model: model_repair.ModelRepair
 ) -> list[Joint]:
-    """Weld free bodies and joints outside the chain; return the moving joints without held ones."""
+    """Weld free bodies and joints outside the chain; return joints that still move."""
     moving = list[Joint]()
     for body in world.with_descendants():
         joints, body.joints = body.joints, []
@@ -152,11 +152,11 @@ def _weld_other_joints_and_list_moving(
             is_held = joint.kind != "free" and joint.name in model.purpose.held_positions
             if joint.kind == "free":
                 if chain:  # a tool is welded to the sensor
-                    model.add_assumption("welded to the world, where it may float:", body.name)
+                    model.add_assumption("welded to the world instead of floating:", body.name)
             elif not is_held and body not in chain:
                 model.add_assumption("held:", joint.name)
             elif not is_held and joint.kind not in ("hinge", "slide"):
-                model.add_fault(f"{joint.name} is a {joint.kind} joint; use hinges and slides")
+                model.add_fault(f"joint {joint.name} is a {joint.kind} joint; use hinge or slide")
             else:
                 body.joints.append(joint)
                 moving += [] if is_held else [joint]
@@ -178,32 +178,32 @@ def _check_joint_couplings(arm: Body, chain: list[Body], joints: list[Joint], mj
         if given.get("active") == "false":
             continue
         if element.tag == "joint" and moving.issuperset(filter(None, ends)):
-            model.add_fault(f"{ends[0]} moves with another joint (equality); hold one of them")
+            model.add_fault(f"{ends[0]} moves with another joint (equality); add it to slave.hold")
         elif element.tag in ("connect", "weld", "distance") and closes_loop:
-            model.add_fault(f"a {element.tag} equality closes a loop of links; remove it")
+            model.add_fault(f"the {element.tag} equality closes a loop of links; remove it")
         else:
             name = given.get("name") or " and ".join(filter(None, ends)) or element.tag
-            model.add_assumption("no effect of this equality on the arm:", name)
+            model.add_assumption("no effect on the arm of the equality constraint", name)
     for element in mjcf.elements_in("tendon"):
         for name in (each.get("joint", "") for each in element.iter("joint")):
             if name in moving:
-                model.add_assumption("no tendon, which the model has, of", name)
+                model.add_assumption("no effect of the tendons in the file on", name)
     for joint in joints:
         for attribute, what in (("stiffness", "spring"), ("frictionloss", "dry friction")):
             if joint.attributes.number(attribute, 0.0) != 0.0:
-                model.add_assumption(f"no {what}, which the model has, of", joint.name)
+                model.add_assumption(f"no effect of the {what} in the file on", joint.name)
 
 
 def _report_unread_couplings_and_springs(joints: list[Joint], mjcf: Mjcf) -> None:
     for element in (*mjcf.elements_in("equality"), *mjcf.elements_in("tendon")):
         if element.get("active") != "false":
             name = f"{element.tag} {element.get('name', '')}".rstrip()
-            mjcf.model.add_repair("no coupling, which Drake does not read from MJCF, by", name)
+            mjcf.model.add_repair("couplings that Drake does not read from MJCF are lost:", name)
     for joint in joints:
         if joint.attributes.number("stiffness", 0.0) != 0.0:
-            mjcf.model.add_repair("no spring, which Drake does not read from MJCF, of", joint.name)
+            mjcf.model.add_repair("springs, which Drake does not read, are lost:", joint.name)
         if joint.attributes.number("frictionloss", 0.0) != 0.0:
-            mjcf.model.add_assumption("no dry friction, which the model has, of", joint.name)
+            mjcf.model.add_assumption("no effect of the dry friction in the file on", joint.name)
 
 
 def _effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
@@ -237,7 +237,7 @@ def _effort_per_control_unit(given: Attributes, tag: str) -> float:
     if tag != "general" or given.get("kind", "general") not in ("general", "motor"):
         return 0.0
     biased = given.get("biastype", "none") != "none" and any(given.numbers("biasprm", (0.0,) * 3))
-    is_unbounded = given.get("dyntype") in _DYNTYPES_WITH_UNBOUNDED_OUTPUT
+    is_unbounded = given.get("dyntype") in _ACTUATOR_DYNTYPES_WITHOUT_LIMIT
     if biased or given.get("gaintype", "fixed") != "fixed" or is_unbounded:
         return 0.0
     return abs(given.numbers("gainprm", (1.0,))[0])
@@ -251,10 +251,10 @@ def _symmetric_limit_from_range(mjcf: Mjcf, given: Attributes, name: str, flag: 
     return smaller if limits[0] < 0.0 < limits[1] else larger
 
 
-def _check_names_and_generator_tags(bodies: list[Body], model: model_repair.ModelRepair) -> None:
+def _report_equal_names_and_generators(bodies: list[Body], model: model_repair.ModelRepair) -> None:
     for body in bodies:
         for tag in body.generator_tags:
-            model.add_fault(f"{body.name} contains <{tag}>, which is not supported; expand it")
+            model.add_fault(f"{body.name} contains the unsupported <{tag}>; save it from MuJoCo")
     for kind, names in (
         ("bodies", [body.name for body in bodies]),
         ("joints", [joint.name for body in bodies for joint in body.joints]),
@@ -281,7 +281,7 @@ def _set_mass_properties(world: Body, reader: BodyReader, moving: set[Joint], mj
                 inertia = model_numbers.correct_impossible_inertia(scaled.inertia, body.name, model)
             body.inertial = scaled._replace(inertia=inertia)
         elif body in moved and given.inertia.any():
-            model.add_repair("an inertia without a mass left out of", body.name)
+            model.add_repair("inertia is left out, because the mass is 0, of link", body.name)
         if body in driven and body.inertial is ZERO_MASS_PROPERTIES:
             model.add_assumption("no inertia of", body.name)
 

@@ -14,10 +14,10 @@ from drake_teleop.station.slave.model.model_tree import WORLD_NAME, joint_link
 # Row and column: ixx: (0, 0), ixy: (0, 1) and so on.
 _INERTIA_ENTRY_INDICES = {f"i{'xyz'[i]}{'xyz'[k]}": (i, k) for i in range(3) for k in range(i, 3)}
 # Relative changes of an inertia: rounding below the first, suspicious above the second.
-_INERTIA_ROUNDING_SHARE, _SUSPICIOUS_INERTIA_CHANGE_SHARE = 1e-3, 0.05
+_INERTIA_ROUNDING_RATIO, _SUSPICIOUS_INERTIA_CHANGE_RATIO = 1e-3, 0.05
 _INERTIA_ROUNDING_KG_M2 = 1e-15  # changes below this are rounding
 # Margin of corrected moments against rounding in Drake's check, relative to the largest one.
-_TRIANGLE_INEQUALITY_MARGIN_SHARE = 1e-9
+_PRINCIPAL_MOMENT_MARGIN_RATIO = 1e-9
 
 
 def repair_inertia_and_detect_missing(
@@ -26,13 +26,13 @@ def repair_inertia_and_detect_missing(
     """Replace impossible inertia of a link by the nearest possible; return True if none is given.
 
     Changes and faults are reported. If no joint of the arm moves the link (`is_fixed`), impossible
-    inertia is removed, and zero inertia counts as given.
+    inertia is removed, and the result is False.
     """
     name, inertial = link.get("name", ""), link.find("inertial")
     mass_element = link.find("inertial/mass")
     if inertial is None or mass_element is None:
         if is_sdf:
-            model.add_assumption("1 kg, the default of SDF, for", name)
+            model.add_assumption("the mass is 1 kg, the default of SDF, of link", name)
         elif inertial is not None:
             link.remove(inertial)
         return not (is_sdf or is_fixed)
@@ -55,7 +55,7 @@ def repair_inertia_and_detect_missing(
         model.add_fault(f"link {name}: {fault}")
     else:
         if no_mass and inertia.any():
-            model.add_repair("an inertia without a mass left out of", name)
+            model.add_repair("inertia is left out, because the mass is 0, of link", name)
         nearest = np.zeros((3, 3)) if no_mass else correct_impossible_inertia(inertia, name, model)
         entries = {entry: f"{nearest[at]:.17g}" for entry, at in _INERTIA_ENTRY_INDICES.items()}
         pose = inertial.findall("pose" if is_sdf else "origin")[:1]
@@ -87,11 +87,11 @@ def correct_impossible_inertia(inertia: Array, name: str, model: ModelRepair) ->
     """Return the nearest possible inertia tensor (3, 3); report a change for the link `name`."""
     nearest, change = nearest_possible_inertia(inertia)
     largest_change = change * np.abs(inertia).max()
-    if 0.0 < change <= _INERTIA_ROUNDING_SHARE or 0.0 < largest_change <= _INERTIA_ROUNDING_KG_M2:
-        model.add_assumption("an inertia corrected for rounding of", name)
+    if 0.0 < change <= _INERTIA_ROUNDING_RATIO or 0.0 < largest_change <= _INERTIA_ROUNDING_KG_M2:
+        model.add_assumption("rounding errors in the inertia are corrected, of link", name)
     elif change:
         what = "inertia replaced by the nearest possible one (share of its largest moment) of link"
-        warning = "warning: " if change > _SUSPICIOUS_INERTIA_CHANGE_SHARE else ""
+        warning = "warning: " if change > _SUSPICIOUS_INERTIA_CHANGE_RATIO else ""
         model.add_repair(f"{warning}{what}", f"{name} ({100 * change:.3g} %)")
     return nearest
 
@@ -99,9 +99,9 @@ def correct_impossible_inertia(inertia: Array, name: str, model: ModelRepair) ->
 def nearest_possible_inertia(inertia: Array) -> tuple[Array, float]:
     """Return the nearest possible inertia tensor (3, 3) about the centre of mass, and the change.
 
-    Negative principal moments become 0. Then a deficit of p3 <= p1 + p2 is distributed in equal
-    parts, which is nearest in the Frobenius norm. The change is the largest difference of a
-    principal moment, divided by the largest moment; it is 0 for a possible tensor.
+    Negative principal moments become 0. Then an excess of p3 over p1 + p2 is distributed equally,
+    which is nearest in the Frobenius norm. The change is the largest difference of a principal
+    moment, divided by the largest moment.
     """
     given, axes = np.linalg.eigh((inertia + inertia.T) / 2.0)
     moments = np.maximum(given, 0.0)
@@ -110,7 +110,7 @@ def nearest_possible_inertia(inertia: Array) -> tuple[Array, float]:
     if given[0] >= 0.0 and deficit <= 0.0:
         return inertia, 0.0
     moments += max(deficit, 0.0) / 3.0 * np.array([1.0, 1.0, -1.0])
-    moments[0] += _TRIANGLE_INEQUALITY_MARGIN_SHARE * largest
+    moments[0] += _PRINCIPAL_MOMENT_MARGIN_RATIO * largest
     return (axes * moments) @ axes.T, float(np.abs(moments - given).max()) / largest
 
 
@@ -151,7 +151,7 @@ def check_lengths_and_inertias(element: Element, where: str, model: ModelRepair)
             for name, text in inner.attrib.items():
                 values = parse_numbers(text)
                 if len(values) != 3 or any(map(math.isnan, values)):
-                    model.add_fault(f"{where}: origin {name}={text!r} is no list of three numbers")
+                    model.add_fault(f"{where}: {name} of origin is {text!r}, not three numbers")
         for word in " ".join([inner.text or "", *map(str, inner.attrib.values())]).split():
             value = parse_number(word)
             if math.isnan(value) and word.lower().strip("+-") != "nan":
@@ -172,7 +172,7 @@ def repair_joint(joint: Element, links: set[str], model: ModelRepair, *, in_chai
         if not link:
             model.add_fault(f"{where} has no {end} link")
         elif link not in links and link != WORLD_NAME and "::" not in link and in_chain:
-            model.add_fault(f"{where}: its {end} link {link!r} does not exist")
+            model.add_fault(f"{where}: the {end} link {link!r} does not exist")
     check_lengths_and_inertias(joint, where, model)
     is_fixed = joint.get("type") == "fixed"
     for mimic in joint.findall("mimic") if is_fixed or is_held else ():
@@ -192,15 +192,15 @@ def _check_joint_type_mimic_and_axis(joint: Element, where: str, model: ModelRep
     if kind not in ("revolute", "continuous", "prismatic"):
         between = f" on {joint_link(joint, 'parent')}" if kind == "floating" else ""
         remedy = "up to the sensor, use joints that turn about one axis or slide along it"
-        model.add_fault(f"{name} is a {kind} joint{between}; {remedy}")
+        model.add_fault(f"joint {name} is a {kind} joint{between}, which is unsupported; {remedy}")
     elif joint.find("mimic") is not None or joint.find("axis/mimic") is not None:
-        remedy = "remove the tag, or fix the joint by slave.hold"
-        model.add_fault(f"{name} moves with another joint (mimic); {remedy}")
+        remedy = "add it to slave.hold, or remove the tag"
+        model.add_fault(f"joint {name} moves with another joint (mimic); {remedy}")
     axis = joint.find("axis")
     text = None if axis is None else axis.get("xyz") or axis.findtext("xyz")
     values = parse_numbers(text or "1 0 0")
     if len(values) != 3 or not all(map(math.isfinite, values)) or not any(values):
-        model.add_fault(f"{where}: axis {text!r} is no direction; give three numbers")
+        model.add_fault(f"{where}: axis {text!r} is no direction; give 3 numbers, not all 0")
 
 
 def _check_joint_limit(limit: Element, where: str, model: ModelRepair) -> None:
@@ -231,10 +231,10 @@ def _check_joint_dynamics(dynamics: Element, name: str, model: ModelRepair) -> N
     texts = [dynamics.get(tag) or dynamics.findtext(tag) for tag in ("damping", "friction")]
     damping, friction = (parse_number(text or "0") for text in texts)
     if friction != 0.0:
-        model.add_assumption("no dry friction, which the model has, of", name)
+        model.add_assumption("no effect of the dry friction in the file on", name)
         dynamics.attrib.pop("friction", None)
     if not damping >= 0.0:
-        model.add_repair("damping 0 in place of a negative or unreadable one for", name)
+        model.add_repair("damping is 0, not negative or unreadable, of joint", name)
         dynamics.attrib.pop("damping", None)
         for inner in dynamics.findall("damping"):
             dynamics.remove(inner)

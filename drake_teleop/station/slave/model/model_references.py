@@ -53,8 +53,9 @@ class ModelFiles:
         self.packages: dict[str, Path] = {}
         for folder in package_paths:
             if not folder.is_dir():
-                what, remedy = f"there is no folder {folder}", f"correct {PACKAGE_FOLDER_SETTINGS}"
-                raise DrakeTeleopError(f"{what} for its packages", where=str(model), remedy=remedy)
+                remedy = f"correct {PACKAGE_FOLDER_SETTINGS}"
+                what = f"the package folder {folder} does not exist"
+                raise DrakeTeleopError(what, where=str(model), remedy=remedy)
         inner = [each for folder in package_paths for each in sorted(folder.glob("*"))]
         for folder in (*package_paths, *inner):
             if folder.is_dir():
@@ -75,7 +76,7 @@ class ModelFiles:
         self._bases = {""}
 
     def merge_packages_with_map(self, known: PackageMap) -> None:
-        """Merge `packages` and Drake's map `known` into both; omit Drake's downloaded models."""
+        """Add `packages` to Drake's map `known`, and its packages to them, without drake_models."""
         known.Remove("drake_models")
         for name, folder in self.packages.items():
             if known.Contains(name):  # the model's package replaces Drake's
@@ -150,7 +151,7 @@ class ModelFiles:
         return self.sizes[real]
 
     def mesh_files(self) -> Iterator[Path]:
-        """Yield readable meshes, with their textures; call `check_referenced_files` before."""
+        """Yield readable meshes with textures, after `check_referenced_files` found the files."""
         texts = [path for path in self.sizes if path.suffix.lower() in _XML_SUFFIXES]
         for mesh in [m for path in texts for m in self._referenced_files(path, with_meshes=True)]:
             if not self.file_access_fault(mesh, "meshes"):
@@ -231,9 +232,9 @@ def _check_num_files_and_size(files: int, size: int, path: Path) -> None:
     is_text = files == 1 and path.suffix.lower() not in _MESH_AND_IMAGE_SUFFIXES
     most = _MAX_TEXT_FILE_BYTES if is_text else _MAX_MODEL_BYTES
     if files > _MAX_MODEL_FILES or size > most:
-        what = f"{_MAX_MODEL_FILES} files" if files > _MAX_MODEL_FILES else f"{most // 10**6} MB"
-        remedy = "remove or simplify parts"
-        raise DrakeTeleopError(f"exceeds the limit of {what}", where=str(path), remedy=remedy)
+        limit = f"{_MAX_MODEL_FILES} files" if files > _MAX_MODEL_FILES else f"{most // 10**6} MB"
+        what, remedy = f"the model exceeds the limit of {limit}", "remove or simplify parts"
+        raise DrakeTeleopError(what, where=str(path), remedy=remedy)
 
 
 def read_xml(path: Path) -> Element:
@@ -246,7 +247,7 @@ def read_xml(path: Path) -> Element:
     parser.CharacterDataHandler = builder.data
 
     def reject_undefined_entity(name: str | None, *_: object) -> NoReturn:
-        raise ValueError(f"the entity {name} is not defined in this XML file")
+        raise ValueError(f"the entity {name} is not defined in this file")
 
     parser.SkippedEntityHandler = parser.ExternalEntityRefHandler = reject_undefined_entity
     try:

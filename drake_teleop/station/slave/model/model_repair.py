@@ -25,10 +25,10 @@ class ModelPurpose(NamedTuple):
     Attributes:
         sensor_name: frame, link or site of the sensor; empty for tools and surroundings.
         held_positions: angles or positions [rad, m] of joints that do not move.
-        is_tool: whether the model is a tool, whose joints are all fixed.
-        is_scene: whether the model is surroundings; then shapes that are not readable are faults.
-        is_in_directives: whether another file adds or includes the model; then every link is kept.
-        plant_has_shapes: whether the plant has a SceneGraph.
+        is_tool: the model is a tool, whose joints are all fixed.
+        is_scene: the model is surroundings; unreadable shapes are faults.
+        is_in_directives: another file adds the model; every link is kept.
+        plant_has_shapes: the plant has a SceneGraph.
     """
 
     sensor_name: str = ""
@@ -45,8 +45,8 @@ class ModelRepair:
     Attributes:
         folder: folder of converted meshes and of repaired copies of included files.
         text: XML for Drake's parser, with absolute mesh paths; empty without a repair.
-        dependence_reasons: texts by name: why mimic joints or floating links depend on others; with
-            model directives by MODEL::NAME.
+        dependence_reasons: by joint or link name (in directives MODEL::NAME), text on the part that
+            it mimics or floats on.
         auxiliary_bodies: names of massless bodies that the repair added.
     """
 
@@ -65,8 +65,8 @@ class ModelRepair:
         """Root element of the file, which the repair changes in place."""
         return read_xml(self.path)
 
-    def repair_part(self, path: Path, repair: Callable[[ModelRepair], None]) -> ModelRepair:
-        """Repair a file that this one includes or adds; return it, and merge its assumptions."""
+    def repair_file(self, path: Path, repair: Callable[[ModelRepair], None]) -> ModelRepair:
+        """Call `repair` for a file that this one includes; return its state, merge assumptions."""
         purpose = self.purpose._replace(is_in_directives=True)
         part = ModelRepair(path, self.files, purpose, self.folder)
         repair(part)
@@ -101,7 +101,7 @@ class ModelRepair:
         return list(dict.fromkeys([*own, *self._assumptions_of_parts]))
 
     def describe_frame_fault(self, count: int, names: set[str]) -> tuple[str, str]:
-        """Return fault and remedy if `count` frames, not one, have the sensor frame's name."""
+        """Return fault and remedy for `count` frames of the sensor's name; propose near `names`."""
         name = self.purpose.sensor_name
         near = get_close_matches(name, sorted(names), n=_MAX_LISTED_NAMES, cutoff=0.0)
         remedy = f"name one of {', '.join(sorted(near))}" if near else "give a model that has links"

@@ -41,8 +41,8 @@ def reduce_to_chain(
     """Keep only the tree of links with the sensor; fix joints that are not between root and sensor.
 
     Joints that close a loop are removed. Held joints count as fixed. Return the joints from root to
-    sensor link, fixed ones included, and by link the number of moving joints from root to link; or
-    None, with a fault, if joints are ambiguous.
+    sensor link, fixed ones included, and by link the number of moving joints to it; or None, with a
+    fault, if a link has two parents.
     """
     joints = _joint_chain_to_link(scope, sensor_link, model)
     if joints is None:
@@ -56,7 +56,7 @@ def reduce_to_chain(
             for mimic in element.findall("mimic"):
                 if joint.get("type") != "fixed" and mimic.get("joint") not in names:
                     element.remove(mimic)
-                    what = "independent of the joint that it mimics, which does not move S:"
+                    what = "joint moves alone, as the joint that it mimics does not move S:"
                     model.add_assumption(what, joint.get("name", ""))
     for joint in list_joints(scope):
         if joint not in chain and joint.get("name") not in model.purpose.held_positions:
@@ -66,8 +66,7 @@ def reduce_to_chain(
         groups = {num_joints_to_link.get(link_of_frame(scope, name), -1) for name in ends}
         scope.remove(element)
         if len(ends) < 2 or len(groups) > 1:
-            what = f"{element.tag} closes a loop of links"
-            model.add_fault(f"{what}; model only the chain to the sensor")
+            model.add_fault(f"{element.tag} closes a loop of links; remove this element")
     return chain, num_joints_to_link
 
 
@@ -110,7 +109,7 @@ def _weld_floating_base(scope: Element, chain: list[Element], model: ModelRepair
     if first is None or chain[first].get("type") not in ("floating", "planar"):
         return chain
     base = joint_link(chain[first], "child")
-    model.add_assumption("welded to the world, where it may float:", base)
+    model.add_assumption("welded to the world instead of floating:", base)
     scope.remove(chain[first])
     for link in scope.findall("link"):
         if link.get("name") == WORLD_NAME:

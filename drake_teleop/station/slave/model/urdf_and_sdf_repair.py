@@ -39,8 +39,8 @@ def repair_urdf(model: ModelRepair) -> None:
     _repair_links_and_joints(model, is_sdf=False)
     if not model.purpose.is_scene:
         _remove_references_to_missing_parts(root)
-        _keep_one_motor_per_joint(model)
-    _convert_meshes_and_set_text(model)
+        _keep_one_transmission_per_joint(model)
+    _convert_meshes_and_write_xml(model)
 
 
 def repair_sdf(model: ModelRepair) -> None:
@@ -54,7 +54,7 @@ def repair_sdf(model: ModelRepair) -> None:
     model.raise_faults()
     for uri in model.root.iterfind(".//include/uri"):
         _repair_included_file(uri, model)
-    _convert_meshes_and_set_text(model)
+    _convert_meshes_and_write_xml(model)
 
 
 def _remove_children_ignored_by_drake(elements: list[Element]) -> None:
@@ -70,7 +70,7 @@ def _repair_links_and_joints(model: ModelRepair, *, is_sdf: bool) -> None:
     scopes = [each for each in model.root.iter() if each.tag in ("robot", "model")]
     for scope in scopes:
         if is_sdf:
-            _attach_joints_to_links_of_frames(scope)
+            _replace_frames_of_joints_by_links(scope)
         _make_joint_and_link_names_unique(scope, model, is_sdf=is_sdf)
     chain, num_joints_to_link = _reduce_model_to_arm(scopes, model) or (set(), {})
     for scope in scopes:
@@ -89,16 +89,16 @@ def _repair_links_and_joints(model: ModelRepair, *, is_sdf: bool) -> None:
                 model.add_assumption("no inertia of", name)
 
 
-def _convert_meshes_and_set_text(model: ModelRepair) -> None:
+def _convert_meshes_and_write_xml(model: ModelRepair) -> None:
     model.raise_faults()
     remove_unusable_shapes(model)
     model.raise_faults()
-    model.dependence_reasons = find_dependence_reasons(model.root) | model.dependence_reasons
+    model.dependence_reasons = find_mimics_and_floating_links(model.root) | model.dependence_reasons
     model.text = ElementTree.tostring(model.root, encoding="unicode")
 
 
-def find_dependence_reasons(root: Element) -> dict[str, str]:
-    """Return texts by name: why mimic joints and floating links depend on other joints or links."""
+def find_mimics_and_floating_links(root: Element) -> dict[str, str]:
+    """Return, by name of mimic joint or floating link, on which part it depends."""
     found: dict[str, str] = {}
     for joint in root.iter("joint"):
         parent = joint_link(joint, "parent")
@@ -123,7 +123,7 @@ def _reduce_model_to_arm(
     return model_tree.reduce_to_chain(scopes[0], link, model) if link else None
 
 
-def _attach_joints_to_links_of_frames(scope: Element) -> None:
+def _replace_frames_of_joints_by_links(scope: Element) -> None:
     for joint in list_joints(scope):
         for element in (*joint.findall("parent"), *joint.findall("child")):
             name = (element.text or "").strip()
@@ -143,7 +143,7 @@ def _make_joint_and_link_names_unique(scope: Element, model: ModelRepair, *, is_
         name = joint.get("name", "")
         if not name or name in names:
             new = f"{name or 'joint'}_{number_of_joint}"
-            model.add_repair("a new name for the joint", f"{name or 'without name'} ({new})")
+            model.add_repair("a unique name for joint", f"{name or 'without name'} ({new})")
             joint.set("name", new)
         names.add(joint.get("name", ""))
     links, children = set[str](), Counter(joint_link(joint, "child") for joint in joints)
@@ -153,7 +153,7 @@ def _make_joint_and_link_names_unique(scope: Element, model: ModelRepair, *, is_
             model.add_fault(f"two links are named {name}; rename one of them")
         elif name in links:
             scope.remove(link)
-            model.add_repair("a second link of the same name left out:", name)
+            model.add_repair("a second link with the same name is left out:", name)
         links.add(name)
 
 
@@ -192,7 +192,7 @@ def _remove_references_to_missing_parts(root: Element) -> None:
             root.remove(group)
 
 
-def _keep_one_motor_per_joint(model: ModelRepair) -> None:
+def _keep_one_transmission_per_joint(model: ModelRepair) -> None:
     root = model.root
     moving = {x.get("name", "") for x in list_joints(root) if x.get("type") in _ONE_AXIS_TYPES}
     for motor in root.findall("transmission"):
@@ -212,7 +212,7 @@ def _keep_one_motor_per_joint(model: ModelRepair) -> None:
 
 
 def _repair_included_file(uri: Element, model: ModelRepair) -> None:
-    """Replace an include's address by the absolute path of its file, or of the repaired copy."""
+    """Replace the address in an include by the absolute path of the file or repaired copy."""
     address = (uri.text or "").strip()
     included = _find_included_model_file(address, model)
     if included is None:  # Drake searches in more places, and crashes on a circle through them
@@ -222,7 +222,7 @@ def _repair_included_file(uri: Element, model: ModelRepair) -> None:
     uri.text = f"file://{included.resolve()}"  # or Drake uses the working folder
     repair = {".urdf": repair_urdf, ".sdf": repair_sdf}.get(included.suffix.lower())
     if repair is not None and included.is_file():
-        part = model.repair_part(included, repair)
+        part = model.repair_file(included, repair)
         model.dependence_reasons |= part.dependence_reasons
         uri.text = f"file://{model.write_file(included.name, part.text)}"
 
@@ -255,7 +255,7 @@ def _remove_models_without_sensor_frame(model: ModelRepair) -> None:
     for other in named:
         if other is not kept:
             name = other.get("name") or other.findtext("name") or other.findtext("uri") or ""
-            model.add_repair("models beside the arm left out:", name)
+            model.add_repair("models beside the arm are left out:", name)
 
 
 def _has_sensor_frame(element: Element, model: ModelRepair) -> bool:
