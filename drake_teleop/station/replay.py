@@ -160,7 +160,7 @@ def _find_logs_of_run(run: Path) -> list[Path]:
     if not logs:
         remedy = "give a folder from drake-teleop run or reproduce, or a log.parquet; a study"
         remedy = f"{remedy} stores measures only: run one of its points as a scenario"
-        raise DrakeTeleopError("contains no log of a run", where=str(run), remedy=remedy)
+        raise DrakeTeleopError("the folder contains no log of a run", where=str(run), remedy=remedy)
     return logs
 
 

@@ -54,15 +54,16 @@ _MIN_KINEMATIC_SCALE_WITH_PASSIVITY = 1e-4  # 0.1 um at the slave for 1 mm at th
 class Rates:
     """Sampling rates; in the paper: sensor 8 kHz, hand > 2 kHz, joint control 10 kHz."""
 
-    sensor_hz: float = quantity(8000.0, "Hz", 10.0, 1e5, "wrist sensor and encoders")
+    sensor_hz: float = quantity(8000.0, "Hz", 10.0, 1e5, "rate of wrist sensor and encoders")
     hand_hz: float = quantity(
-        2000.0, "Hz", 10.0, 1e5, "haptic device and channel; 1 kHz or more with a simulated device"
-    )
+        2000.0, "Hz", 10.0, 1e5,
+        "rate of haptic device and channel; 1 kHz or more with a simulated device",
+    )  # fmt: skip
     joint_control_hz: float = quantity(
-        2000.0, "Hz", 10.0, 1e5, "joint control of the slave; above 2 kHz, several samples a step"
+        2000.0, "Hz", 10.0, 1e5, "slave's joint control rate; above 2 kHz: several per event"
     )
-    estimator_hz: float = quantity(1000.0, "Hz", 10.0, 1e5, "load estimator and contact detection")
-    log_hz: float = quantity(1000.0, "Hz", 1.0, 1e5, "rows of the log")
+    estimator_hz: float = quantity(1000.0, "Hz", 10.0, 1e5, "rate of estimator and detection")
+    log_hz: float = quantity(1000.0, "Hz", 1.0, 1e5, "rate of log rows")
 
 
 @settings
@@ -75,7 +76,7 @@ class Simulation:
     """
 
     duration: float = quantity(1.0, "s", 1e-3, 36000.0, "logged time")
-    settle: float = quantity(0.5, "s", 0.0, 60.0, "time before the log starts, at t < 0")
+    settle: float = quantity(0.5, "s", 0.0, 60.0, "settling time before the log, at t < 0")
     integrator: str = choice(
         "runge_kutta3", ("runge_kutta3", "runge_kutta2", "semi_explicit_euler"), "Drake's scheme"
     )
@@ -84,7 +85,7 @@ class Simulation:
     seed: int = quantity(0, "1", 0, 2**32 - 1, "random seed; equal seeds give equal logs")
     end_with_task: bool = plain(False, "end within 20 ms after the log contains the task's outcome")
     on_fault: str = choice(
-        "continue", ("continue", "stop"), "after a fault: go on in a safe state, or end in an error"
+        "continue", ("continue", "stop"), "after a fault: hold a safe state, or stop with an error"
     )
 
 

@@ -22,7 +22,7 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.packet import dot_of_group, pose_difference_into
 from drake_teleop.station.stepped_block import SteppedBlock
 
-_NETWORK_PRESET_CHOICES = ("custom", *PRESETS)
+_NETWORK_NAMES = ("custom", *PRESETS)
 #: Smallest default and largest timeout [s].
 MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.1, 1.0
 _TIMEOUT_OVER_LONGEST_SILENCE = 1.5  # default timeout over the longest silence of a minute
@@ -33,12 +33,12 @@ _TIMEOUT_OVER_LONGEST_SILENCE = 1.5  # default timeout over the longest silence 
 class Channel(NetworkConfig):
     """Settings of the network between master and slave: a preset, or `custom` with its fields."""
 
-    network: str = choice("custom", _NETWORK_PRESET_CHOICES, "a preset, or custom for these fields")
-    backward: NetworkConfig | None = plain(None, "network from slave to master; null: the same")
+    network: str = choice("custom", _NETWORK_NAMES, "network preset; custom: use the other fields")
+    backward: NetworkConfig | None = plain(None, "slave-to-master network; null: as for commands")
     timeout: float | None = quantity(
         None, "s", 1e-3, MAX_TIMEOUT_S,
-        "silence after which an end enters its safe state; null: 1.5 times the longest silence in "
-        "a minute of this network, at least 0.1 s",
+        "time without packets before master or slave enters its safe state; null: 1.5 times the "
+        "longest such time in a minute of this network, at least 0.1 s",
     )  # fmt: skip
 
     def networks_of_directions(self, where: str = "channel") -> tuple[NetworkConfig, NetworkConfig]:

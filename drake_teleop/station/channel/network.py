@@ -41,15 +41,15 @@ class NetworkConfig:
     """Settings of one direction of a network; the default is ideal: packet k arrives at step k."""
 
     delay: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "mean one-way delay")
-    jitter: float = quantity(0.0, "1", 0.0, 1.0, "sqrt(3) * standard deviation / mean of delay")
+    jitter: float = quantity(0.0, "1", 0.0, 1.0, "sqrt(3) * standard deviation / mean of the delay")
     distribution: str = choice("uniform", tuple(_MAX_DEVIATION_OVER_JITTER), "delay distribution")
     loss: float = quantity(0.0, "1", 0.0, 1.0, "mean share of lost packets")
-    burst: float = quantity(0.0, "s", 0.0, 100.0, "mean length of a bad state; 0: independent loss")
-    burst_loss: float = quantity(1.0, "1", 0.01, 1.0, "share of lost packets in a bad state")
+    burst: float = quantity(0.0, "s", 0.0, 100.0, "mean duration of a loss burst; 0: no bursts")
+    burst_loss: float = quantity(1.0, "1", 0.01, 1.0, "share of packets that a loss burst loses")
     duplicate: float = quantity(0.0, "1", 0.0, 1.0, "share of duplicated packets")
     rate_hz: float | None = quantity(None, "Hz", 1.0, 1e5, "largest packet rate; null: every step")
-    playout: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "packets are used at this age or later")
-    redundant: bool = plain(False, "packets repeat the data of the last `playout` seconds")
+    playout: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "jitter buffer: age of packets at use")
+    redundant: bool = plain(False, "each packet repeats the data of the last `playout` seconds")
     trace: str | None = plain(
         None,
         "CSV file of a recorded delay, relative to the scenario's folder, instead of delay, jitter "
@@ -60,8 +60,8 @@ class NetworkConfig:
     silence: str = choice(
         "hold",
         _SILENCE_POLICY_NAMES,
-        "values at steps without a new packet; hold: the newest packet; zero: the same with zero "
-        "velocity and wrench; extrapolate: the same with a pose that keeps its velocity for 0.1 s. "
+        "values at steps without a new packet; hold: the newest packet; zero: its pose with zero "
+        "velocity and wrench; extrapolate: its pose moved on at its velocity, for up to 0.1 s. "
         "Energies and integrals are always held",
     )
 

@@ -23,12 +23,12 @@ from drake_teleop.station.slave.arm import ArmModel, acceleration_from_specific_
 class ContactDetectionConfig:
     """Settings of the contact detector."""
 
-    statistic: str = choice("glr", STATISTIC_NAMES, "statistic that is compared with the threshold")
+    statistic: str = choice("glr", STATISTIC_NAMES, "statistic of the contact wrench for detection")
     margin: float = quantity(
-        THRESHOLD_MARGIN, "1", 1.0, 10.0, "ratio of threshold to the largest value in free motion"
+        THRESHOLD_MARGIN, "1", 1.0, 10.0, "ratio of threshold to largest statistic in free motion"
     )
     hold: float = quantity(0.02, "s", 0.0, 1.0, "time below the threshold that ends a contact")
-    drift_time: float = quantity(5.0, "s", 0.5, 1e4, "time constant of the subtracted mean")
+    drift_time: float = quantity(5.0, "s", 0.5, 1e4, "time constant that removes wrench drift")
     recovery: float = quantity(5e-3, "s", 0.0, 1.0, "pause of the detection after a saturation")
 
 

@@ -31,21 +31,20 @@ class LoadEstimatorConfig:
         "update with every sample; only for free motion: a contact wrench would count as load",
     )
     forgetting: float = quantity(1.0, "1", 0.9, 1.0, "forgetting factor per sample; 1 = none")
-    method: str = choice("rls", (), "rls: least squares; rtls: total, for noisy motion", METHODS)
+    method: str = choice("rls", (), "rls: least squares; rtls: total least squares", METHODS)
     settled_bound: float = quantity(
-        0.05, "1", 1e-6, 10.0, "standard deviation of a settled load relative to its natural scale"
+        0.05, "1", 1e-6, 10.0, "largest relative standard deviation of a settled load"
     )
-    watch: bool = plain(False, "freeze a settled load or one with covariance; detect its change")
+    watch: bool = plain(False, "keep a settled or given load constant; detect its change")
     relative_wrench_error: float = quantity(
-        0.0, "1", 0.0, 0.5, "watch: relative wrench error due to gains, cross-talk and delays"
+        0.0, "1", 0.0, 0.5, "relative wrench error by gains, cross-talk, delays; for `watch`"
     )
 
     def check(self, where: str) -> None:
         if self.enabled and self.watch and not METHODS[self.method].allows_for_noisy_motion:
-            what = f"'{self.method}' ignores the noise of the motion"
-            result = "its covariance is too small to detect a change of load"
+            what = f"'{self.method}' ignores the noise of motion, so it detects no change of load"
             remedy = "set method: rtls, or watch: false"
-            raise DrakeTeleopError(f"{what}, so {result}", where=f"{where}.method", remedy=remedy)
+            raise DrakeTeleopError(what, where=f"{where}.method", remedy=remedy)
 
 
 class LoadEstimator(LeafSystem):

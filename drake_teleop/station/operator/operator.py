@@ -61,7 +61,7 @@ class MinimumJerk:
     duration: float = quantity(1.0, "s", 1e-3, 1e6, "duration of the move")
     translation: list[float] = quantity([0.0, 0.0, 0.0], "m", -1.0, 1.0, "displacement in B")
     rotation: list[float] = quantity(
-        [0.0, 0.0, 0.0], "rad", -3.14, 3.14, "rotation vector of the offset, about axes of B"
+        [0.0, 0.0, 0.0], "rad", -3.14, 3.14, "rotation vector, about axes of the master's base B"
     )
 
 
@@ -75,12 +75,12 @@ class Sine:
 
     t_start: float = quantity(0.0, "s", 0.0, 1e6, "start of the first ramp")
     duration: float = quantity(1.0, "s", 1e-3, 1e6, "duration, both ramps included")
-    ramp: float = quantity(0.1, "s", 1e-3, 1e6, "length of each ramp, at most half the duration")
+    ramp: float = quantity(0.1, "s", 1e-3, 1e6, "time of each ramp, at most half of duration")
     frequency: float = quantity(1.0, "Hz", 0.0, 100.0, "frequency")
     phase: float = quantity(0.0, "rad", -7.0, 7.0, "phase at t_start")
     translation: list[float] = quantity([0.0, 0.0, 0.0], "m", -1.0, 1.0, "amplitude in B")
     rotation: list[float] = quantity(
-        [0.0, 0.0, 0.0], "rad", -3.14, 3.14, "rotation vector of the amplitude, about axes of B"
+        [0.0, 0.0, 0.0], "rad", -3.14, 3.14, "amplitude as rotation vector, about axes of base B"
     )
 
 
@@ -89,10 +89,10 @@ class Sine:
 class OperatorConfig:
     """Settings of the operator: grip, intended motion and task."""
 
-    grip: str = choice("medium", tuple(GRIP_IMPEDANCES), "stiffness, damping and mass of the hand")
-    intent: list[MinimumJerk | Sine] = plain([], "moves relative to the start pose; they add up")
+    grip: str = choice("medium", tuple(GRIP_IMPEDANCES), "grip: preset of the hand's impedance")
+    intent: list[MinimumJerk | Sine] = plain([], "hand movements from the start pose, summed")
     task: Reach | Touch | Press | Insert | None = plain(
-        None, "task with vision and force perception, in addition to the intent"
+        None, "task by vision and force perception; its motion adds to `intent`"
     )
     perception: Perception = field(default_factory=Perception)
     movement: Movement = field(default_factory=Movement)

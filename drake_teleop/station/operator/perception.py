@@ -46,12 +46,12 @@ class Perception:
     masking_time: float = quantity(0.3, "s", 1e-3, 10.0, "decay time constant of masking")
     bandwidth_hz: float = quantity(20.0, "Hz", 1.0, 50.0, "bandwidth of perceived force and motion")
     reaction_time: float = quantity(0.16, "s", 0.0, 1.0, "time from a force to the hand's reaction")
-    vision_delay: float = quantity(0.15, "s", 0.0, 1.0, "time from vision to the hand's reaction")
+    vision_delay: float = quantity(0.15, "s", 0.0, 1.0, "time from a seen motion to the reaction")
     vision_noise: float = quantity(
         0.5e-3, "m", 0.0, 0.1, "standard deviation of a perceived position, at the tool"
     )
     depth_error: float = quantity(2e-3, "m", 0.0, 0.1, "standard deviation of a perceived depth")
-    aim_error: float = quantity(1e-3, "m", 0.0, 0.1, "standard deviation of a slot's xy position")
+    aim_error: float = quantity(1e-3, "m", 0.0, 0.1, "standard deviation of perceived slot x and y")
 
     def compiled_parameters(self, dt: float) -> Array:
         """Return (4,): Weber fraction, threshold [N]; masking decay, low-pass gain per `dt` [s]."""

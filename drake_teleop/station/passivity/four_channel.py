@@ -27,18 +27,18 @@ class FourChannelConfig:
 
     stiffness: list[float] = quantity(
         [100.0, 1.0], "N/m, N m/rad", 0.0, 1e6,
-        "stiffness of C_m, the spring between the hand and the received pose of the slave",
+        "spring between the hand and the received pose of the slave (C_m)",
     )  # fmt: skip
     damping: list[float] = quantity(
-        [10.0, 0.05], "N s/m, N m s/rad", 0.0, 1e6, "damper of C_m, parallel to its spring"
+        [10.0, 0.05], "N s/m, N m s/rad", 0.0, 1e6, "damper between hand and received slave pose"
     )
     slave_feedback: float = quantity(
         0.0, "1", -1.0, 10.0,
-        "C5, gain of the contact force at the slave; that of the hand's force is C3 = 1 + C5",
+        "local gain C5 of the contact force at the slave; the received hand force has C3 = 1 + C5",
     )  # fmt: skip
     hand_feedback: float = quantity(
         0.0, "1", -1.0, 10.0,
-        "C6, gain of the hand's force at the master; that of the contact force is C2 = 1 + C6",
+        "local gain C6 of the hand force at the master; the received contact force: C2 = 1 + C6",
     )  # fmt: skip
 
     def pack_into(self, p: Array) -> None:

@@ -72,11 +72,11 @@ class LedgerConfig:
 
     initial: list[float] = quantity(
         [0.12, 0.011], "J", 0.0, 1e3,
-        "E_0, energy of both ends together at the start; the drag adds the rest of the reserves",
+        "energy E_0 of both ends together at the start; `drag` on the hand then fills the reserves",
     )  # fmt: skip
     reserve: list[float] = quantity(
         [0.1, 0.01], "J", 1e-9, 1e3,
-        "energy reserve of the slave: scaled kinetic energy of its fastest motion",
+        "energy reserve of the slave; bounds its kinetic energy and so its speed",
     )  # fmt: skip
     hand_reserve: list[float] = quantity(
         [0.02, 1e-3], "J", 1e-9, 1e3, "energy reserve of the master, to push the hand"
@@ -85,7 +85,7 @@ class LedgerConfig:
         [0.28, 5e-3], "N, N m", 0.0, 10.0, "drag on the hand until both reserves are full"
     )
     touch: list[float] = quantity(
-        [0.01, 1e-3], "N, N m", 0.0, 1e3, "contact threshold of the wrench at the hand"
+        [0.01, 1e-3], "N, N m", 0.0, 1e3, "smallest wrench at the hand that counts as contact"
     )
     encoder_step: list[float] | None = quantity(
         None, "m, rad", 0.0, 0.1,

@@ -22,7 +22,7 @@ class SlotAllocator:
         if self._next > self._size:
             raise IndexError(
                 f"SlotAllocator: {self._next} places are required, but the vector has {self._size};"
-                " reserve fewer"
+                " increase its size"
             )
         return slice(first, self._next)
 

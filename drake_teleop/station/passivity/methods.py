@@ -125,7 +125,7 @@ class PassivityConfig:
     torque_limit: float = quantity(0.17, "N m", 0.0, 1e3, "largest rendered torque at the hand")
     retreat: list[float] = quantity(
         [0.1, 1.0], "m/s, rad/s", 1e-3, 1e3,
-        "hand speed along the wrench from which the wrench fades, to zero at twice the speed",
+        "hand speed along the wrench above which the wrench fades, to 0 at twice this speed",
     )  # fmt: skip
     servo_stiffness: list[float] = quantity(
         [2.1e5, 6.8e3], "N/m, N m/rad", 1.0, 1e9, "K of the slave's servo, in the slave's units (E)"
@@ -139,7 +139,7 @@ class PassivityConfig:
         "mass of arm and tool at the tool, in the slave's units; null: with ledger, mass and servo"
         " of the station's arm at the start; else 15.13, 0.5 (E)", length=2,
     )  # fmt: skip
-    registered: dict[str, float] = plain({}, "parameters of a registered method, by name")
+    registered: dict[str, float] = plain({}, "parameters of a custom method: name and value")
     wave: WaveConfig = field(default_factory=WaveConfig)
     tdpa: TdpaConfig = field(default_factory=TdpaConfig)
     charged_tdpa: TdpaConfig = field(default_factory=charged_tdpa_config)

@@ -31,10 +31,10 @@ _SPRING_DEFLECTION, _REQUESTED_SPRING_DEFLECTION = _layout.vector(6), _layout.ve
 class PspmConfig:
     """Parameters of the passive set-position modulation."""
 
-    initial: list[float] = quantity([0.01, 2e-4], "J", 0.0, 1e3, "energy E of an end at the start")
+    initial: list[float] = quantity([0.01, 2e-4], "J", 0.0, 1e3, "stored energy at the start")
     ceiling: list[float] = quantity(
         [0.015, 3e-4], "J", 0.0, 1e6,
-        "largest E; the master sends any excess to the slave, the slave discards it",
+        "largest stored energy of an end; the master sends any excess, the slave discards it",
     )  # fmt: skip
     stiffness: list[float] = quantity(
         [1000.0, 10.0], "N/m, N m/rad", 1e-6, 1e9, "K_h, spring between set position and hand"

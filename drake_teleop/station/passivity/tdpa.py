@@ -64,17 +64,17 @@ class TdpaConfig:
     )
     drift_rate: float = quantity(
         20.0, "1/s", 0.0, 1e3,
-        "rate of the return to the received command, within the available energy",
+        "rate at which the command returns to the received one, within the available energy",
     )  # fmt: skip
     speed: list[float] = quantity(
         [1.0, 10.0], "m/s, rad/s", 1e-3, 1e3,
-        "largest speed of the slave's command; an impact may create its kinetic energy",
+        "largest speed of the slave's command; bounds the energy that an impact may create",
     )  # fmt: skip
     reserve: list[float] = quantity(
-        [2e-3, 1e-4], "J", 0.0, 1e3, "energy from the hand that the master keeps"
+        [2e-3, 1e-4], "J", 0.0, 1e3, "energy of the hand's work that the master keeps"
     )
     drag: list[float] = quantity(
-        [0.0, 0.0], "N, N m", 0.0, 10.0, "drag on the hand while an end has less than the reserve"
+        [0.0, 0.0], "N, N m", 0.0, 10.0, "drag on the hand while an end has less than `reserve`"
     )
     hand_stiffness: list[float] = quantity(
         [0.0, 0.0], "N/m, N m/rad", 0.0, 1e5,

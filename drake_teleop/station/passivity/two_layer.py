@@ -42,7 +42,7 @@ class TwoLayerConfig:
         [0.015, 3e-4], "J", 0.0, 1e6, "largest energy of a tank; any excess is discarded"
     )
     damper: list[float] = quantity(
-        [500.0, 100.0], "N s/m/J, N m s/rad/J", 0.0, 1e6, "damping of the hand for each J missing"
+        [500.0, 100.0], "N s/m/J, N m s/rad/J", 0.0, 1e6, "damping of the hand per missing energy"
     )
     acceleration: list[float] = quantity(
         [20.0, 200.0], "m/s^2, rad/s^2", 0.0, 1e6, "a_max, largest acceleration of either end"

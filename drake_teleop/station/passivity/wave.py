@@ -45,10 +45,10 @@ class WaveConfig:
     )
     patience: float = quantity(
         0.03, "s", 0.0, 10.0,
-        "silence after which the slave keeps its command until the next packet",
+        "time without packets after which the slave keeps its command until the next packet",
     )  # fmt: skip
     drift_rate: float = quantity(
-        2.0, "1/s", 0.0, 1e3, "rate of the correction of pose drift, where it needs no energy"
+        2.0, "1/s", 0.0, 1e3, "rate of the pose drift correction, only while it takes no energy"
     )
 
     def pack_into(self, p: Array) -> None:

@@ -54,21 +54,21 @@ class Scales(NamedTuple):
 class ForceScalingConfig:
     """Settings of the force scaling: sigma, gamma, eta of the paper; scale from slave to master."""
 
-    sigma: float = quantity(1.0, "1", 0.0, 100.0, "share of the non-contact wrench that is kept")
+    sigma: float = quantity(1.0, "1", 0.0, 100.0, "kept share of the load's weight and inertia")
     gamma: float = quantity(1.0, "1", 0.0, 100.0, "scale of the contact wrench")
     eta: float | None = quantity(
-        None, "1", 0.0, 1.0, "Eq. (14): kept share of the object; needs sigma = 0 and gamma = 1"
+        None, "1", 0.0, 1.0, "kept share of the object's wrench, Eq. (14); needs sigma 0, gamma 1"
     )
     gripper_phi: list[float] | None = quantity(
         *(None, "kg, kg m, kg m^2", -1e3, 1e3, "phi of the gripper alone; null: all is gripper"),
         length=10,
     )
-    force_scale: float = quantity(1 / 17.5, "1", 0.0, 100.0, "wrench scale, slave to master (VI-B)")
+    force_scale: float = quantity(1 / 17.5, "1", 0.0, 100.0, "rendered wrench over slave's wrench")
     sigma_weight: float | None = quantity(
-        None, "1", 0.0, 100.0, "share of the load's weight that is kept; null: sigma"
+        None, "1", 0.0, 100.0, "kept share of the load's weight; null: value of sigma"
     )
     sigma_inertia: float | None = quantity(
-        None, "1", 0.0, 100.0, "share of the load's inertia that is kept; null: sigma"
+        None, "1", 0.0, 100.0, "kept share of the load's inertia; null: value of sigma"
     )
 
     def scales(self, where: str = "force_scaling") -> Scales:

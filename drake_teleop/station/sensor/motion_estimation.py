@@ -68,12 +68,12 @@ _MEMORY_SIZE_PER_JOINT = 5 + 2 * _NUM_ANGLE_LOW_PASS_SECTIONS
 class MotionEstimationConfig:
     """Settings of the estimation of the motion of the sensor frame S."""
 
-    source: str = choice("accelerometer", _MOTION_SOURCES, "source of omega and accelerations")
+    source: str = choice("accelerometer", _MOTION_SOURCES, "source of the estimated motion")
     encoder_bandwidth_hz: float = quantity(
         50.0, "Hz", 1.0, 1e4, "low-pass of the angles, 4th-order Butterworth (source `encoders`)"
     )
     acceleration_drift: float = quantity(
-        0.05, "m/s^2/sqrt(s)", 1e-6, 1e3, "random walk of the error of s (source `fused`)"
+        0.05, "m/s^2/sqrt(s)", 1e-6, 1e3, "random walk of the specific-force error (source `fused`)"
     )
     angular_acceleration_drift: float = quantity(
         0.5, "rad/s^2/sqrt(s)", 1e-6, 1e4, "random walk of the error of alpha (source `fused`)"

@@ -77,14 +77,14 @@ class WristSensorConfig:
             "in_python": "set wrist_sensor = drake_teleop.station.sensor.presets.PRESETS[name]",
         },
     )
-    ideal: bool = plain(False, "true values at the sampling instant, at So in S, without errors")
+    ideal: bool = plain(False, "no sensor errors: true values in sensor frame S, without delay")
 
     gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest gain error of force and torque")
-    cross_talk: float = quantity(0.0, "1", 0.0, 0.1, "full-range cross-talk as share of own range")
-    misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "angle from S to the real wrench axes")
+    cross_talk: float = quantity(0.0, "1", 0.0, 0.1, "cross-talk at another channel's full range")
+    misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "rotation error of the wrench axes from S")
     acceleration_gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest acceleration gain error")
-    acceleration_misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "angle from A to real axes")
-    unit: int = quantity(0, "1", 0, 2**32 - 1, "seed of the calibration errors within their bounds")
+    acceleration_misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "rotation error of axes A")
+    unit: int = quantity(0, "1", 0, 2**32 - 1, "unit number, seed of the calibration errors")
 
     p_SoAo_S: list[float] = quantity([0.0, 0.0, 0.0175], "m", -1.0, 1.0, "accelerometer position")
     R_SA: list[float] = quantity(
@@ -117,8 +117,8 @@ class WristSensorConfig:
     encoder_resolution: float = quantity(1.745e-5, "rad", 0.0, 0.1, "resolver step, 0.001 deg")
 
     saturates: bool = plain(True, "readings are limited to the ranges and flagged by `saturated`")
-    force_range: list[float] = quantity([200.0, 200.0, 400.0], "N", 1.0, 1e5, "range of fx, fy, fz")
-    torque_range: list[float] = quantity([12.0] * 3, "N m", 0.01, 1e4, "range of tx, ty, tz at So")
+    force_range: list[float] = quantity([200.0, 200.0, 400.0], "N", 1.0, 1e5, "force range x, y, z")
+    torque_range: list[float] = quantity([12.0] * 3, "N m", 0.01, 1e4, "torque range x, y, z at So")
     acceleration_range: float = quantity(50.0, "m/s^2", 1.0, 1e4, "range of each axis")
     angular_acceleration_range: float = quantity(500.0, "rad/s^2", 1.0, 1e5, "range of each axis")
 
@@ -189,9 +189,9 @@ class WristSensorConfig:
 
 def check_bandwidth(bandwidth_hz: float, rate_hz: float, where: str, alternative: str = "") -> None:
     if bandwidth_hz >= 0.45 * rate_hz:
-        what = f"a bandwidth of {bandwidth_hz:g} Hz is too near to half of the sensor's rate"
+        what = f"bandwidth {bandwidth_hz:g} Hz is too near half of the sensor's rate ({rate_hz:g} Hz)"
         remedy = f"lower the bandwidth below 0.45 of the sensor's rate{alternative}"
-        raise DrakeTeleopError(f"{what} ({rate_hz:g} Hz)", where=where, remedy=remedy)
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
 
 
 _CALIBRATION_ERROR_FIELDS = (
