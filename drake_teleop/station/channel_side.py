@@ -52,7 +52,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         return builder.Build()
     scaling = scenario.kinematic_scaling
     R_WB, scales = scaling.R_WB, scaling.scales
-    passivity, start = _passivity_config_for_arm_and_device(scenario), start_pose(scenario.slave)
+    passivity, start = _passivity_with_mass_and_encoder_step(scenario), start_pose(scenario.slave)
     gain, period = _rendered_force_per_contact_force(scenario), 1 / scenario.rates.hand_hz
     seed = scenario.simulation.seed
     block = TeleopChannel(scenario.channel, passivity, R_WB, scales, gain, start, period, seed)
@@ -68,7 +68,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
     return builder.Build()
 
 
-def _passivity_config_for_arm_and_device(scenario: Scenario) -> PassivityConfig:
+def _passivity_with_mass_and_encoder_step(scenario: Scenario) -> PassivityConfig:
     passivity, device = passivity_config_with_arm_mass(scenario), scenario.master.device(0.0, 0.0)
     ledger = passivity.ledger
     if ledger.encoder_step is None:
@@ -102,7 +102,7 @@ def passivity_config_with_arm_mass(scenario: Scenario) -> PassivityConfig:
     )
 
 
-def slave_wrench_power_scale(scenario: Scenario) -> Array:
+def slave_to_master_power_unit_scale(scenario: Scenario) -> Array:
     """Return factors (2,) from slave wrench to master's power units (T29): force, torque."""
     scales = scenario.kinematic_scaling.scales
     return _rendered_force_per_contact_force(scenario) / np.where(scales > 0.0, scales, 1.0)

@@ -185,7 +185,7 @@ def _check_speed_limit_of_energy_reserve(result: SimulationResult, scenario: Sce
     t, sent, received = result.t, result["pose_command"], result["pose_received"]
     config, row = scenario.passivity.method_config(), t[1] - t[0]
     mass = np.array(channel_side.passivity_config_with_arm_mass(scenario).slave_mass)
-    limit = speed_limit(config, mass * channel_side.slave_wrench_power_scale(scenario))
+    limit = speed_limit(config, mass * channel_side.slave_to_master_power_unit_scale(scenario))
     forward, period = scenario.channel.networks_of_directions()[0], 1.0 / scenario.rates.hand_hz
     step = np.rint((t + scenario.simulation.settle) / period).astype(int)
     newest = newest_packets(forward, scenario.simulation.seed, FORWARD, step[-1] + 1, period)

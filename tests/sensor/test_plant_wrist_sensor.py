@@ -480,7 +480,7 @@ REFUSED = {
     ),
     "bandwidth": (
         lambda c: c.options.update(config=WristSensorConfig()),
-        "AddWristSensor.bandwidth_hz: bandwidth 500 Hz is too near half of the sensor's rate "
+        "AddWristSensor.bandwidth_hz: bandwidth 500 Hz is too near half the sensor's rate "
         "(1000 Hz)",
     ),
 }

@@ -33,7 +33,7 @@ class ContactDetectionConfig:
 
 
 @njit(cache=True)
-def _detect_contact_using_arm(memory, sample, estimate, arm, settings):
+def _detect_with_joint_angles(memory, sample, estimate, arm, settings):
     s, acceleration = sample[regressor.SAMPLE_SPECIFIC_FORCE], np.empty(3)
     q = sample[regressor.FIRST_JOINT_INDEX : regressor.SAMPLE_TIME_INDEX]
     acceleration_from_specific_force_into(arm, q, s, acceleration)
@@ -95,7 +95,7 @@ class ContactDetection(LeafSystem):
     def _update_and_get_contact_flag(
         self, context: Context, memory: Array, sample: Array, estimate: Array
     ) -> bool:
-        return bool(_detect_contact_using_arm(memory, sample, estimate, self._arm, self._settings))
+        return bool(_detect_with_joint_angles(memory, sample, estimate, self._arm, self._settings))
 
     def _update_contact_flag_state(self, context: Context, discrete_state: DiscreteValues) -> None:
         sample = self._sample.Eval(context)

@@ -114,7 +114,7 @@ class LoadEstimator(LeafSystem):
         if sample[SATURATION_FLAG_INDEX] > 0.0 or not are_valid_port_values(sample):
             return
         estimate = discrete_state.get_mutable_value(0)
-        if self._read_load_state_code(discrete_state) != STATE_LEARNING:
+        if self._read_code_of_load_state(discrete_state) != STATE_LEARNING:
             memory = discrete_state.get_mutable_value(2)
             watched.monitor_load(estimate, memory, sample, *self._watch_arguments)
             return
@@ -127,12 +127,12 @@ class LoadEstimator(LeafSystem):
             covariance = self._estimator.covariance_of(estimate, memory)
             discrete_state.set_value(2, watched.initial_monitor_memory(estimate, covariance))
 
-    def _read_load_state_code(self, discrete_state: DiscreteValues) -> int:
+    def _read_code_of_load_state(self, discrete_state: DiscreteValues) -> int:
         return int(discrete_state.value(2)[STATE_INDEX]) if self._watches else STATE_LEARNING
 
     def _calc_load_state(self, context: Context, output: BasicVector) -> None:
         state = context.get_discrete_state()
-        output[0] = self._read_load_state_code(state)
+        output[0] = self._read_code_of_load_state(state)
         if not self._watches:
             estimate, memory = state.value(0), state.value(1)
             settled = self._estimator.is_state_settled(estimate, memory.reshape(self._shape))

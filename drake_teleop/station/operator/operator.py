@@ -290,7 +290,7 @@ class Operator(LeafSystem):
         self._has_task = config.task is not None
         self._pose = self.DeclareVectorInputPort("pose_master", 7)
         self._twist = self.DeclareVectorInputPort("twist_master", 6)
-        moving = self._declare_intended_motion_sources() | {self.time_ticket()}
+        moving = self._declare_intended_motion_ports() | {self.time_ticket()}
         if config.task is not None:
             if training is None or arm is None or tip is None:
                 raise ValueError("Operator: a task requires the arguments training, arm and tip")
@@ -301,7 +301,7 @@ class Operator(LeafSystem):
             self._perceived_forces = _make_delay_buffer(senses.reaction_time, nothing_felt)
             person = decision.pack_operator_parameters(training, senses, config.movement)
             task_and_person = decision.pack_task_parameters(config.task), person
-            hand_and_arm = senses.compiled_parameters(period), hand.mass, arm.table
+            hand_and_arm = senses.packed_for_compiled_code(period), hand.mass, arm.table
             self._task_parameters = (*task_and_person, *hand_and_arm, np.array(tip, dtype=float))
             self._joints = arm.num_joints
             self._slave = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
@@ -317,7 +317,7 @@ class Operator(LeafSystem):
         self._wrench = self.DeclareVectorOutputPort("hand_wrench_E", 6, calc, held | moving)
         self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intended_pose), moving)
 
-    def _declare_intended_motion_sources(self) -> set[DependencyTicket]:
+    def _declare_intended_motion_ports(self) -> set[DependencyTicket]:
         # `LiveHand` replaces these ports by a path to external targets.
         pose = self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
         twist = self._intended_twist = self.DeclareVectorInputPort("intended_twist", 6)

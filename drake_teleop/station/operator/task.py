@@ -87,7 +87,7 @@ class Movement:
     approach_speed: float = quantity(
         0.03, "m/s", 1e-3, 1.0, "tool speed in a careful approach, at full trust in touch"
     )
-    gentle_force: float = quantity(2.0, "N", 0.01, 100.0, "harmless contact force, sets approach speed")
+    gentle_force: float = quantity(2.0, "N", 0.01, 100.0, "harmless contact force at the tool")
 
 
 def check_target_beyond_standoff(task: Task, where: str) -> None:

@@ -44,7 +44,7 @@ from drake_teleop.station.passivity.wave import WaveConfig
 
 
 @njit(cache=True)
-def _ignore_command_change(requested, command, pose, twist, p, memory):
+def _keep_memory_at_command_change(requested, command, pose, twist, p, memory):
     pass
 
 
@@ -64,7 +64,7 @@ class PassivityMethod(NamedTuple):
 
     master_step: Any
     slave_step: Any
-    record_command: Any = _ignore_command_change
+    record_command: Any = _keep_memory_at_command_change
     initialize: Callable[[Array, Array], None] | None = None
     config: type[Any] | None = None
     balance_at_motors: bool = False
@@ -73,7 +73,7 @@ class PassivityMethod(NamedTuple):
     speed_limit: Callable[[Any, Array], Array] | None = None
 
 
-def _method_functions(module: Any) -> tuple[Any, Any, Any, Any]:
+def _functions_of_module(module: Any) -> tuple[Any, Any, Any, Any]:
     return module.master_step, module.slave_step, module.record_command, module.initialize
 
 
@@ -85,8 +85,8 @@ METHODS = Registry(
         "wave": PassivityMethod(wave.master_step, wave.slave_step),
         "tdpa": _TDPA_METHOD,
         "charged_tdpa": _TDPA_METHOD,
-        "two_layer": PassivityMethod(*_method_functions(two_layer), balance_at_motors=True),
-        "pspm": PassivityMethod(*_method_functions(pspm), balance_at_motors=True),
+        "two_layer": PassivityMethod(*_functions_of_module(two_layer), balance_at_motors=True),
+        "pspm": PassivityMethod(*_functions_of_module(pspm), balance_at_motors=True),
         "ledger": PassivityMethod(
             ledger.master_step,
             ledger_slave.slave_step,
@@ -215,27 +215,27 @@ def initial_method_memory(method: str, parameters: Array, pose: Array) -> Array:
     return memory
 
 
-_VECTOR_TYPE = types.Array(types.float64, 1, "C")
-_STEP_ARGUMENT_TYPES = (
-    (_VECTOR_TYPE, types.boolean, *[_VECTOR_TYPE] * 5, types.float64, *[_VECTOR_TYPE] * 4),
-    (_VECTOR_TYPE, types.boolean, *[_VECTOR_TYPE] * 4, types.float64, *[_VECTOR_TYPE] * 4),
-    (_VECTOR_TYPE,) * 6,
+_NUMBA_VECTOR = types.Array(types.float64, 1, "C")
+_NUMBA_STEP_ARGUMENT_TYPES = (
+    (_NUMBA_VECTOR, types.boolean, *[_NUMBA_VECTOR] * 5, types.float64, *[_NUMBA_VECTOR] * 4),
+    (_NUMBA_VECTOR, types.boolean, *[_NUMBA_VECTOR] * 4, types.float64, *[_NUMBA_VECTOR] * 4),
+    (_NUMBA_VECTOR,) * 6,
 )
-_call_master, _call_slave, _call_record = map(make_call_at_address, _STEP_ARGUMENT_TYPES)
+_call_master, _call_slave, _call_record = map(make_call_at_address, _NUMBA_STEP_ARGUMENT_TYPES)
 
 
 def step_addresses(method: str) -> tuple[int, ...]:
     """Return the addresses of `master_step`, `slave_step` and `record_command` of a method."""
-    return _addresses_of_compiled_steps(*METHODS[method][:3])
+    return _memory_addresses_of_functions(*METHODS[method][:3])
 
 
 @cache
-def _addresses_of_compiled_steps(*steps: Any) -> tuple[int, ...]:
-    return tuple(map(address_of_function, steps, _STEP_ARGUMENT_TYPES))
+def _memory_addresses_of_functions(*steps: Any) -> tuple[int, ...]:
+    return tuple(map(address_of_function, steps, _NUMBA_STEP_ARGUMENT_TYPES))
 
 
 @njit(cache=True)
-def _number_packet_or_repeat_last_healthy(healthy, memory, packet):
+def _finish_packet_or_repeat_last_healthy(healthy, memory, packet):
     if healthy:
         packet[fields.SENDER_INPUTS_FINITE] = 1.0
         copy_into(memory, slots.LAST_HEALTHY_SENT_PACKET.start, packet, 0, fields.PACKET_SIZE)
@@ -275,7 +275,7 @@ def master_step(
             steps[0], received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
         )
         fade_retreat_wrench(twist, T, p, memory, wrench)
-    _number_packet_or_repeat_last_healthy(healthy, memory, packet)
+    _finish_packet_or_repeat_last_healthy(healthy, memory, packet)
 
 
 @njit(cache=True)
@@ -299,7 +299,7 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
         _call_slave(
             steps[1], received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
         )
-    _number_packet_or_repeat_last_healthy(healthy, memory, packet)
+    _finish_packet_or_repeat_last_healthy(healthy, memory, packet)
 
 
 @njit(cache=True)

@@ -21,18 +21,18 @@ RESUME_TIME_S = 0.5  #: time of the transition to normal operation [s]
 _HAND_VELOCITY_FILTER_S = 4e-3  # of the velocity: encoders have steps
 MASTER_MONITOR_SIZE, SLAVE_MONITOR_SIZE = 6, 30  #: lengths of the monitor states
 # Monitor state of the master.
-_layout = slots.SlotAllocator(MASTER_MONITOR_SIZE)
-SILENCE_TIME_INDEX = _layout.number()  #: time without packets [s], also at the slave
-_PRESENT_HAND_WRENCH_LIMITS = _layout.vector(2)  # present limits
-_WRENCH_LIMIT_FALL_RATE = _layout.vector(2)  # their decrease per second
-_CONNECTED_TIME = _layout.number()  # time since the last silence
+_master_monitor_slots = slots.SlotAllocator(MASTER_MONITOR_SIZE)
+SILENCE_TIME_INDEX = _master_monitor_slots.number()  #: time without packets [s], also at the slave
+_PRESENT_HAND_WRENCH_LIMITS = _master_monitor_slots.vector(2)  # present limits
+_WRENCH_LIMIT_FALL_RATE = _master_monitor_slots.vector(2)  # their decrease per second
+_CONNECTED_TIME = _master_monitor_slots.number()  # time since the last silence
 # Monitor state of the slave.
-_layout = slots.SlotAllocator(SLAVE_MONITOR_SIZE, SILENCE_TIME_INDEX + 1)
-_TIME_SINCE_STOP_BEGAN = _layout.number()  # time since it began to stop
-_TIME_SINCE_RESUME_BEGAN = _layout.number()  # time since it began to resume
-_COMMAND_POSE_AT_STOP = _layout.vector(7)  # command when it began to stop
-_COMMAND_VELOCITY_AT_STOP_START = _layout.vector(6)  # its velocity
-_LAST_COMMAND, _COMMAND_BEFORE_LAST = _layout.vector(7), _layout.vector(7)
+_slave_monitor_slots = slots.SlotAllocator(SLAVE_MONITOR_SIZE, SILENCE_TIME_INDEX + 1)
+_TIME_SINCE_STOP_BEGAN = _slave_monitor_slots.number()  # time since it began to stop
+_TIME_SINCE_RESUME_BEGAN = _slave_monitor_slots.number()  # time since it began to resume
+_COMMAND_POSE_AT_STOP = _slave_monitor_slots.vector(7)  # command when it began to stop
+_COMMAND_VELOCITY_AT_STOP_START = _slave_monitor_slots.vector(6)  # its velocity
+_LAST_COMMAND, _COMMAND_BEFORE_LAST = map(_slave_monitor_slots.vector, (7, 7))
 
 
 def initial_master_monitor(device_limits: Array | None = None) -> Array:

@@ -21,8 +21,8 @@ from drake_teleop.station.passivity.packet import dot_of_group, length_of_group,
 _KEPT_HAND_ENERGY_SHARE = 0.5
 # Onset and end of a wrench that needs no delay filter: slower than hand and servo [s].
 _WRENCH_ONSET_FILTER_S = 0.1
-_MAX_ENDED_OVER_FILTERED_WRENCH = 0.1  # a wrench below this share of the filtered one ends
-_MIN_COMPLETE_ONSET_SHARE = 0.98  # share at which a quick onset is complete
+_CONTACT_END_WRENCH_RATIO = 0.1  # a wrench below this share of the filtered one ends
+_WRENCH_SHARE_AT_ONSET_END = 0.98  # share at which a quick onset is complete
 # Travel over which the contact stiffness is averaged [m, rad], and speed below which the drag fades
 # [m/s, rad/s], for translation and rotation.
 _STIFFNESS_AVERAGING_TRAVEL_M_RAD = (1e-3, 1e-2)
@@ -33,21 +33,21 @@ _NEWEST_MASTER_PACKET_NUMBER = fields.METHOD_VALUES.start
 _PACKET_SLAVE_ENERGY = fields.SENDER_ENERGY
 
 # Parameters; reserve, drag and stiffness in the master's power units.
-_layout = slots.own_parameters()
-_WRENCH_RELEASE_TIME, _LEDGER_DRAIN_RATE, _COMMAND_DRIFT_RATE = (_layout.number() for _ in range(3))
-_TARGET_RESERVE, _DRAG_WRENCH, _HAND_STIFFNESS = (_layout.vector(2) for _ in range(3))
-_MAX_COMMAND_SPEED = _layout.vector(2)
+_parameter_slots = slots.own_parameters()
+_WRENCH_RELEASE_TIME, _LEDGER_DRAIN_RATE, _COMMAND_DRIFT_RATE = _parameter_slots.numbers(3)
+_TARGET_RESERVE, _DRAG_WRENCH, _HAND_STIFFNESS = map(_parameter_slots.vector, [2] * 3)
+_MAX_COMMAND_SPEED = _parameter_slots.vector(2)
 # Memory of the master: withheld share of the wrench, kept energy.
-_layout = slots.own_memory()
-_WITHHELD_WRENCH_SHARE, _MASTER_RESERVED_ENERGY = _layout.vector(2), _layout.vector(2)
+_master_memory_slots = slots.own_memory()
+_WITHHELD_WRENCH_SHARE, _MASTER_RESERVED_ENERGY = map(_master_memory_slots.vector, (2, 2))
 # Memory of the slave: work in and out at the actual and the commanded motion; withheld motion;
 # filtered wrench; contact stiffness; number of the packet that completed a quick onset.
-_layout = slots.own_memory()
-_SLAVE_WORK_IN, _SLAVE_WORK_OUT = _layout.vector(2), _layout.vector(2)
-_COMMAND_WORK_IN, _COMMAND_WORK_OUT = _layout.vector(2), _layout.vector(2)
-_WITHHELD_COMMAND_MOTION, _FILTERED_SLAVE_WRENCH = _layout.vector(6), _layout.vector(6)
-_CONTACT_STIFFNESS_ESTIMATE, _QUICK_ONSET_PACKET_NUMBER = _layout.vector(2), _layout.vector(2)
-_LAST_COMMAND_POSE = _layout.vector(7)  # the command of the last step
+_slave_memory_slots = slots.own_memory()
+_SLAVE_WORK_IN, _SLAVE_WORK_OUT = map(_slave_memory_slots.vector, (2, 2))
+_COMMAND_WORK_IN, _COMMAND_WORK_OUT = map(_slave_memory_slots.vector, (2, 2))
+_WITHHELD_COMMAND_MOTION, _FILTERED_SLAVE_WRENCH = map(_slave_memory_slots.vector, (6, 6))
+_CONTACT_STIFFNESS_ESTIMATE, _QUICK_ONSET_PACKET_NUMBER = map(_slave_memory_slots.vector, (2, 2))
+_LAST_COMMAND_POSE = _slave_memory_slots.vector(7)  # the command of the last step
 
 
 @settings
@@ -109,7 +109,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         work_on_hand = dot_of_group(wrench, dx, g)
         stored = ledger[g] + kept[g]
         if share * work_on_hand > drain * stored:
-            max_decrease = fields.MAX_HAND_WRENCH_RATE[g] * T / p[slots.SLAVE_PER_MASTER_MOTION][g]
+            max_decrease = fields.MAX_HAND_WRENCH_RATES[g] * T / p[slots.SLAVE_PER_MASTER_MOTION][g]
             least = length_of_group(memory[slots.LAST_PORT_WRENCH], g) - max_decrease
             by_rates = max(drain * stored / work_on_hand, least / length_of_group(wrench, g))
             share = min(share, by_rates, stored / work_on_hand)
@@ -117,7 +117,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         memory[slots.DISSIPATED_ENERGY][g] += (1.0 - share) * work_on_hand
         fields.scale_group(wrench, g, share)
         _add_hand_drag(g, received[_PACKET_SLAVE_ENERGY][g], dx, limits, T, p, memory, wrench)
-        _update_ledger_by_hand_work_of_group(g, dot_of_group(wrench, dx, g), p, memory)
+        _subtract_hand_work_of_group(g, dot_of_group(wrench, dx, g), p, memory)
         if p[_DRAG_WRENCH][g] > 0.0:
             surplus = min(max(ledger[g] + kept[g] - p[_TARGET_RESERVE][g], 0.0), ledger[g])
             ledger[g] -= surplus
@@ -139,7 +139,7 @@ def _add_hand_drag(g, slave_ledger, dx, limits, T, p, memory, wrench):
 
 
 @njit(cache=True)
-def _update_ledger_by_hand_work_of_group(g, work_on_hand, p, memory):
+def _subtract_hand_work_of_group(g, work_on_hand, p, memory):
     ledger, kept = memory[slots.STORED_ENERGY], memory[_MASTER_RESERVED_ENERGY]
     if work_on_hand > 0.0:
         more = min(ledger[g] - work_on_hand, 0.0)
@@ -187,10 +187,10 @@ def _filter_returned_wrench_of_group(g, received, dx, wrench, T, p, memory):
         size, filtered_size = length_of_group(wrench, g), length_of_group(filtered, g)
         onset_rate = min(T / _WRENCH_ONSET_FILTER_S, 1.0)
         rate = min(T / (lag * (1.0 + math.e * gain)), 1.0)
-        if size < _MAX_ENDED_OVER_FILTERED_WRENCH * filtered_size:
+        if size < _CONTACT_END_WRENCH_RATIO * filtered_size:
             rate = max(rate, onset_rate)
         else:
-            if filtered_size * (1.0 + gain) < _MIN_COMPLETE_ONSET_SHARE * size:
+            if filtered_size * (1.0 + gain) < _WRENCH_SHARE_AT_ONSET_END * size:
                 onset = onset_rate
                 memory[_QUICK_ONSET_PACKET_NUMBER][g] = memory[slots.STEP_COUNT]
             awaited = received[_NEWEST_MASTER_PACKET_NUMBER] < memory[_QUICK_ONSET_PACKET_NUMBER][g]

@@ -14,14 +14,14 @@ from drake_teleop.station.passivity import packet as fields
 from drake_teleop.station.passivity.packet import dot_of_group, fill_packet, length_of_group
 
 # Parameters; pairs are for translation and rotation.
-_layout = slots.own_parameters()
-_SEND_RATE, _MAX_TANK_DRAIN_RATE = _layout.number(), _layout.number()
-_INITIAL_TANK_ENERGY, _TARGET_TANK_LEVEL, _TANK_CAPACITY = (_layout.vector(2) for _ in range(3))
-_DAMPING_PER_MISSING_ENERGY, MAX_PORT_ACCELERATION = _layout.vector(2), _layout.vector(2)
+_parameter_slots = slots.own_parameters()
+_SEND_RATE, _MAX_TANK_DRAIN_RATE = _parameter_slots.numbers(2)
+_INITIAL_TANK_ENERGY, _TARGET_TANK_LEVEL, _TANK_CAPACITY = map(_parameter_slots.vector, [2] * 3)
+_DAMPING_PER_MISSING_ENERGY, MAX_PORT_ACCELERATION = map(_parameter_slots.vector, (2, 2))
 _RESERVE_PER_CAPACITY = 0.01  # share of the capacity
 # Memory of the slave: wrench of the spring, wrench of the damper.
-_layout = slots.own_memory()
-_SERVO_SPRING_WRENCH, _SERVO_DAMPER_WRENCH = _layout.vector(6), _layout.vector(6)
+_memory_slots = slots.own_memory()
+_SERVO_SPRING_WRENCH, _SERVO_DAMPER_WRENCH = map(_memory_slots.vector, (6, 6))
 
 
 @settings

@@ -376,12 +376,12 @@ def _small_rotation_vector_into(R_before, R, rotation_vector):
 
 
 @njit(cache=True)
-def _update_fusion_filters(gains, period, displacement_to_correction, acceleration, filter_memory):
+def _update_fusion_filters(gains, period, change_in_correction_out, acceleration, filter_memory):
     for i in range(3):
         mean = (acceleration[i] + 10.0 * filter_memory[6 + i] + filter_memory[9 + i]) / 12.0
         rate = filter_memory[3 + i] + period * mean
-        innovation = filter_memory[i] + displacement_to_correction[i] - period * rate
+        innovation = filter_memory[i] + change_in_correction_out[i] - period * rate
         filter_memory[i] = innovation - gains[0] * innovation
         filter_memory[3 + i] = rate + gains[1] * innovation
         filter_memory[9 + i] = filter_memory[6 + i]
-        displacement_to_correction[i] = gains[2] * innovation
+        change_in_correction_out[i] = gains[2] * innovation

@@ -189,7 +189,7 @@ class WristSensorConfig:
 
 def check_bandwidth(bandwidth_hz: float, rate_hz: float, where: str, alternative: str = "") -> None:
     if bandwidth_hz >= 0.45 * rate_hz:
-        what = f"bandwidth {bandwidth_hz:g} Hz is too near half of the sensor's rate ({rate_hz:g} Hz)"
+        what = f"bandwidth {bandwidth_hz:g} Hz is too near half the sensor's rate ({rate_hz:g} Hz)"
         remedy = f"lower the bandwidth below 0.45 of the sensor's rate{alternative}"
         raise DrakeTeleopError(what, where=where, remedy=remedy)
 

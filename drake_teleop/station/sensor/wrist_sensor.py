@@ -64,7 +64,7 @@ _EQUAL_TIME_TOLERANCE_PERIODS, _MAX_QUEUED_PLANT_STEPS = 1e-6, 16
 #: tolerance: rounding is 1e-12, in a stiff contact 1e-9.
 _ACCELERATION_CHECK_PERIOD_S, _ACCELERATION_CHECK_TOLERANCE = 0.1, 1e-6
 #: Value of `contact_W` in `take_due_samples` that selects the compiled contact law.
-_EMPTY_WRENCH_FOR_COMPILED_CONTACT = np.zeros(0)
+_NO_GIVEN_CONTACT_WRENCH = np.zeros(0)
 
 
 @njit(cache=True)
@@ -387,7 +387,7 @@ class WristSensor(LeafSystem):
 
     def _take_due_samples_into(self, context: Context, include_now: bool, result: Array) -> None:
         seen = self._states_of_arm_and_environment(context)
-        near, contact_W = self._classify_tool_proximity(*seen), _EMPTY_WRENCH_FOR_COMPILED_CONTACT
+        near, contact_W = self._classify_tool_proximity(*seen), _NO_GIVEN_CONTACT_WRENCH
         if include_now and near == PROXIMITY_FAR:
             contact_W = self._zero_wrench
         elif include_now and (near == PROXIMITY_NEAR_MONITORED or self._uses_plant_contact):
