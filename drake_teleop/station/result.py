@@ -193,7 +193,7 @@ class SimulationResult:
         """Return the wrist sensor's samples as a log for `identify` and `eliminate`.
 
         Columns ``t``, ``f_x`` ... ``tau_z``, ``s_x`` ..., ``omega_x`` ..., ``alpha_x`` ... in S and
-        SI units, with the sign of Eq. (1). Each sampling instant ``t`` has one row.
+        SI units; the wrench is that on the load. Each sampling instant ``t`` has one row.
         """
         import polars as pl
 
@@ -229,7 +229,7 @@ class SimulationResult:
         A part with the same `first_row` is replaced, except by an empty result.
 
         Args:
-            folder: folder of the log, prepared by `remove_log`.
+            folder: folder of the log.
             first_row: index of this result's first row in the whole log.
         """
         part = log_part_path(folder, first_row)

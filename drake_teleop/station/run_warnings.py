@@ -52,7 +52,7 @@ _REDUCE_FORCE_ADVICE = "reduce force_scaling.gamma or force_scale"
 def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> list[str]:
     """Return a warning, with times, for each condition in docs/running.md that occurred.
 
-    Checks whose optional signals were not recorded are skipped. `arm` is the slave's arm.
+    Checks whose optional signals were not recorded are skipped.
     """
     overlaps, _ = start_overlap_texts(scenario.slave, scenario.surroundings)
     if not len(result.t):
@@ -84,9 +84,9 @@ def find_spans(t: Array, flags: Flags, min_duration: float = 0.0) -> Spans:
 
 
 def lag_beyond_delay(t: Array, command: Array, actual: Array, window: float) -> Array:
-    """Return distances (N,) of `actual` (N, k) from the range of `command` (N, k) before it.
+    """Return distances (N,) of `actual` (N, k) from the range of `command` (N, k) in a window.
 
-    The range covers the last `window` [s]: a pure delay gives 0. Times `t` [s] are evenly spaced.
+    The window is the last `window` [s]: a pure delay gives 0. Times `t` [s] are evenly spaced.
     """
     rows = max(round(window / (t[1] - t[0])), 1) + 1 if len(t) > 1 else 1
     above = actual - _trailing_maximum(command, rows)
@@ -217,6 +217,7 @@ def _check_speed_limit_of_energy_reserve(result: SimulationResult, scenario: Sce
 def _pose_parts_with_lag_limits(
     command: Array, actual: Array
 ) -> tuple[tuple[Array, Array, float, str, float], ...]:
+    """Return command, actual, largest lag, its unit and unit factor of position and rotation."""
     wanted, turned = (doubled_quaternions(pose, command) for pose in (command, actual))
     return (
         (command[:, 4:], actual[:, 4:], _MIN_WARNED_COMMAND_LAG_M, "mm", 1e3),

@@ -123,7 +123,7 @@ class Scenario:
 
     @property
     def first_sheet_spring(self) -> SheetSpring | None:
-        """The scenario's sheet spring, from `sheet_spring` or `environment`, or None."""
+        """Elastic sheet to touch, from `sheet_spring` or `environment`, or None."""
         return next((thing for thing in self._environments if isinstance(thing, SheetSpring)), None)
 
     @property
@@ -213,7 +213,7 @@ def find_shipped_file(kind: str, name_or_path: str | Path, folder: Path, where: 
 def settings_without_range_check(
     schema: type[_T], data: Any, where: str, defaults: _T | None = None
 ) -> _T:
-    """Return a `schema` object from YAML data, without range checks; `where` begins messages."""
+    """Return an object of class `schema` from YAML data, without range checks of its fields."""
     config.check_structure(schema, data, where)
     data = dict(data)
     things = [dict(thing) for thing in data.pop("environment", [])] if schema is Scenario else []
@@ -249,7 +249,7 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
 
 
 def referenced_files(scenario: Scenario) -> list[Path]:
-    """Return the files with absolute paths in the scenario, and the files that these include."""
+    """Return the files at absolute paths in the scenario, and the files that they include."""
     leader = scenario.master.leader
     packages = map(Path, () if leader is None else leader.package_paths)
     folders = (*scenario.slave.package_folders, *packages)

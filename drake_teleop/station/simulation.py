@@ -37,7 +37,7 @@ def simulate(
 
     Args:
         diagram: station from `MakeTeleopStation`.
-        simulation: duration, settling time, integrator and seed; required.
+        simulation: duration, settling time, integrator and seed.
         progress: True shows a progress bar after one second; or a function of the completed
             fraction.
         log: folder for a log in parts, written during the run so that memory does not grow. After

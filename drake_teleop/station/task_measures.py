@@ -121,7 +121,7 @@ def true_contact_force_magnitudes(result: SimulationResult) -> Array:
 
 
 def detection_delay(t: Array, touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> float:
-    """Return the time from the first contact to the next detection [s]; nan without either."""
+    """Return the time from the first contact to the next detection [s]; nan if one is missing."""
     if not touching.any():
         return math.nan
     contact = int(np.argmax(touching))

@@ -1,4 +1,4 @@
-"""Blocks of the channel: a network, and a passivity method's two ends for any network."""
+"""Blocks of the channel: a network, and the passivity method at its master's and slave's end."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class NetworkChannel(SteppedBlock):
         - packet: (N,) numbers to send
         output_ports:
         - received: (N + 1,) newest packet that has arrived, zeros before the first; 1 if it is new
-        - arriving: (N + 1,) value of `received` in the next period; direct feedthrough
+        - arriving: (N + 1,) as `received`, one period earlier; direct feedthrough
 
     Connect `arriving` to a block with the same period and without direct feedthrough.
 
@@ -133,7 +133,7 @@ class PassivityAtMaster(_PassivityEndBlock):
         - hand_wrench_E: (6,) wrench of the hand on the stylus at E, in B; 0 if unconnected
         output_ports:
         - packet: (38,) for the slave
-        - wrench_to_master: (6,) F_E_B to render at the hand [N, N m]
+        - wrench_to_master: (6,) F_E_B, [f; tau] to render on the stylus at E, in B [N, N m]
 
     Args:
         passivity: method and parameters, equal at both ends.
@@ -166,7 +166,7 @@ class PassivityAtSlave(_PassivityEndBlock):
         name: PassivityAtSlave
         input_ports:
         - received: (39,) newest packet from the master; 1 if it is new
-        - wrench_B: (6,) F_E_B to render, from force scaling [N, N m]
+        - wrench_B: (6,) F_E_B to render at the hand, output of `ForceScaling` [N, N m]
         - load_wrench_B: (6,) part of wrench_B from the load, for method `ledger`; 0 if unconnected
         - pose_slave: (7,) actual X_WS of the slave
         - saturated: (1,) 1 to send the last valid wrench instead; 0 if unconnected

@@ -21,7 +21,6 @@ class _SeparateSignalsAsSample:
         self._ports = [system.DeclareVectorInputPort(*each) for each in sizes]
 
     def Eval(self, context: Context) -> Array:
-        """Return the sample composed of the values of all input ports."""
         sample, first = np.zeros(regressor.FIRST_JOINT_INDEX), 0
         for port in self._ports:
             # Unconnected: `saturated` is 0.

@@ -35,7 +35,7 @@ def _zero_vector_of_type(T: Any, size: int) -> Any:
 @TemplateSystem.define("NonContactWrench_")
 def NonContactWrench_(T: Any) -> Any:
     class NonContactWrenchT(LeafSystem_[T]):
-        """Block that outputs the wrench V phi of a load's weight and inertia, Eq. (12).
+        """Block that outputs the wrench of a load's weight and inertia, Eq. (12).
 
         .. pydrake_system::
 
@@ -49,7 +49,7 @@ def NonContactWrench_(T: Any) -> Any:
             - non_contact_wrench_S: (6,) wrench on the load [N, N m]
 
         Args:
-            phi: (10,) inertial parameters of the load about So, in S; a numeric parameter.
+            phi: (10,) inertial parameters of the load about So, in S.
         """
 
         __slots__ = NO_EXTRA_SLOTS
@@ -86,7 +86,7 @@ NonContactWrench = NonContactWrench_[float]
 @TemplateSystem.define("WrenchScaling_")
 def WrenchScaling_(T: Any) -> Any:
     class WrenchScalingT(LeafSystem_[T]):
-        """Block that outputs contact wrench F_c (Eq. 13) and scaled wrench F' (Eq. T7).
+        """Block that outputs contact wrench F_c and the sum F' of scaled contact and load wrench.
 
         .. pydrake_system::
 

@@ -94,7 +94,7 @@ _ZERO_LOAD_WRENCH = np.zeros(6)
 def pack_parameters_and_mapping(
     passivity: PassivityConfig, R_WB: Array, scales: Array, force_scale: float
 ) -> tuple[Array, Array]:
-    """Return parameters (NUM_PARAMETERS,) of the method, `mapping` (11,) as in `step_channel`."""
+    """Return the method's parameters; R_WB (9) and slave over master motion (2) in one array."""
     # A scale of zero transfers no energy; any unit is valid.
     scales, force_scale = np.where(scales > 0.0, scales, 1.0), force_scale or 1.0
     parameters = methods.method_parameters(passivity, list(force_scale / scales), list(scales))
@@ -126,10 +126,10 @@ def step_channel(
         steps: result of `methods.step_addresses`.
         pose_command, wrench_B, load_B, hand_B, slave_pose, saturated, contact: inputs of
             `TeleopChannel`.
-        T: time between steps [s].
-        timeout: time without packets before the safe state [s].
+        T, timeout: time between steps, time without packets before the safe state [s].
         mapping: (11,) R_WB by rows; slave motion over master motion: translation, rotation.
-        forward, backward, ends: states of both directions and of the ends, updated.
+        parameters, forward_parameters, backward_parameters: of the method and both networks.
+        forward, backward, ends: states of both networks and of both ends, updated.
         pose_received: (7,) written: slave's command X_WS.
         ports: (8,) output port `ports` of `TeleopChannel`: energies updated, times written.
         wrench_received: (7,) written: F_E_B to render, and contact flag of the newest packet.
@@ -158,10 +158,10 @@ def step_master_end(
     steps, pose_command, hand_B, received, fresh, T, timeout, mapping, parameters, ends, work,
     packet, wrench_received,
 ):  # fmt: skip
-    """Run one step of the master's end; arguments are those of `step_channel`.
+    """Run one step of the master's end; other arguments are those of `step_channel`.
 
-    `received` is the slave's newest packet, `fresh` is True if it is new, `packet` is written. The
-    hand's energy input by translation and rotation is added to `work` (2,) [J].
+    `received` is the slave's newest packet, `fresh` True if it is new; `packet` is written. `work`
+    (2,) increases by the hand's work in translation and rotation [J].
     """
     before, held = ends[_MASTER_POSE_AND_INVALID_FLAG_SLICE], ends[_RENDERED_HAND_WRENCH_SLICE]
     monitor, memory = ends[_MASTER_MONITOR_SLICE], ends[MASTER_METHOD_MEMORY_SLICE]
@@ -242,7 +242,7 @@ def step_slave_end(
 def _update_pose_and_twist(pose, before, T, dx, twist):
     """Write the change `dx` (6,) of `pose` (7,) and the `twist` (6,); return if `pose` is valid.
 
-    They are 0 at and after an invalid pose. `before` (8,), updated: last valid pose, 1 if invalid.
+    They are 0 at and after an invalid pose. `before` (8,), updated: last valid pose, invalid flag.
     """
     valid = are_valid_port_values(pose)
     if valid:
@@ -281,9 +281,8 @@ class TeleopChannel(SteppedBlock):
 
     Ports are those of `MakeChannel`, but the outputs to slave and master are pose_received and
     wrench_received; contact is always an input, 0 if unconnected. Only `ledger` uses load_wrench_B.
-    `ports` (8,) contains energy inputs of hand (2) and slave's wrench (2), by translation and
-    rotation [J]; time without packets at master and slave (2) [s]; energy input of the slave's
-    wrench along the slave's command (2) [J].
+    `ports` (8,) contains work of hand (2) and slave's wrench (2) in translation and rotation [J];
+    time without packets at master and slave (2) [s]; work of that wrench along the command (2) [J].
 
     Args:
         R_WB: (3, 3) orientation of the master's base B in world W.
@@ -333,7 +332,7 @@ class TeleopChannel(SteppedBlock):
         self._declare_output("contact_at_hand", 5, _RECEIVED_CONTACT_FLAG_SLICE)
 
     def Restart(self, context: Context, command: Array, slave: Array, fill_time_s: float) -> None:
-        """Start this channel, newly built, in a running station at the slave's present command.
+        """Start this new channel in a running station at the slave's present command.
 
         `command` and `slave` (7,) are commanded and actual X_WS of the slave. Method `wave` keeps
         the command for `fill_time_s`, in which packets fill the channel.

@@ -115,8 +115,7 @@ def network_parameters(
         direction: FORWARD or BACKWARD, with independent random numbers.
         period: time between steps [s].
         min_steps: smallest delay of a packet [steps].
-        delays: (M,) delay of each packet [steps], -1 if lost, instead of the config's trace;
-            repeated after its end.
+        delays: (M,) recorded delays [steps], -1 if lost, instead of `config.trace`; repeated.
     """
     config.check()
     trace = np.zeros(0) if config.trace is None else _read_delay_trace(Path(config.trace), period)
@@ -192,13 +191,13 @@ def _read_delay_trace(path: Path, period: float) -> Array:
 
 
 @njit(cache=True)
-def _random_uniform(p, k, draw):
-    return (float(random_bits(np.uint64(p[_RANDOM_KEY]), 16 * k + draw)) + 1.0) * 2.0**-53
+def _random_uniform(p, packet, draw):
+    return (float(random_bits(np.uint64(p[_RANDOM_KEY]), 16 * packet + draw)) + 1.0) * 2.0**-53
 
 
 @njit(cache=True)
 def _random_packet_delay_steps(p, k, draw):
-    """Return the delay of packet k [steps] (-1: lost), by random numbers `draw` to `draw` + 2."""
+    """Return the delay of packet k [steps] (-1: lost), from its random numbers from `draw` on."""
     if p.shape[0] > _DELAY_TRACE_START:
         steps = p[_DELAY_TRACE_START + k % (p.shape[0] - _DELAY_TRACE_START)]
         return int(max(steps, p[_MIN_DELAY_STEPS])) if steps >= 0.0 else -1
@@ -219,7 +218,7 @@ def _random_packet_delay_steps(p, k, draw):
 
 @njit(cache=True)
 def _random_loss_and_delays(p, k, bad):
-    """Return loss state after `bad` (1: bad), delays of packet and duplicate [steps] (-1: none)."""
+    """Return if a loss burst continues, delays of packet k and its duplicate [steps], -1: none."""
     if p[_BAD_STATE_SHARE] > 0.0:
         likely = p[_BAD_STATE_SHARE] + (bad - p[_BAD_STATE_SHARE]) * p[_BAD_STATE_PERSISTENCE]
         bad = 1.0 if _random_uniform(p, k, 0) <= likely else 0.0
@@ -238,8 +237,7 @@ def _random_loss_and_delays(p, k, bad):
 def initial_network_state(p: Array, initial_packet: Array) -> tuple[Array, Array]:
     """Return the initial state of one direction: receiver (4 + N,), and packets in transit.
 
-    `p` is the result of `network_parameters`, `initial_packet` (N,) what the receiver reads before
-    the first packet.
+    The receiver reads `initial_packet` (N,) until the first packet arrives.
     """
     slots = int(p[_NUM_TRANSIT_SLOTS])
     receiver = np.concatenate([[p[_BAD_STATE_SHARE], -1.0, -1.0, 0.0], initial_packet])

@@ -42,10 +42,9 @@ def _detect_with_joint_angles(memory, sample, estimate, arm, settings):
 
 @njit(cache=True)
 def update_contact_flag_with_sample(memory, sample, estimate, acceleration, settings):
-    """Update a contact detector's `memory` with a sample; return whether there is contact.
+    """Update a contact detector's `memory` with a sensor sample; return whether there is contact.
 
-    `sample` is that of `load.regressor`, `estimate` (16,) [offsets; phi], `acceleration` (3,) of So
-    in S [m/s^2]; `settings` is `ContactDetector.settings`.
+    `estimate` (16,) is [offsets; phi], `acceleration` (3,) that of So in S [m/s^2].
     """
     valid = are_valid_port_values(sample) and are_valid_port_values(estimate)
     if not (valid and are_valid_port_values(acceleration)):
@@ -63,8 +62,7 @@ class ContactDetection(LeafSystem):
 
     The flag keeps its value while the wrist sensor is saturated and for `config.recovery` after.
 
-    Ports are those of `blocks.ContactDetector`, but one input `sample`
-    (`drake_teleop.load.regressor`) replaces the separate signals of the wrist sensor.
+    Ports as `blocks.ContactDetector`, with one input `sample` for all sensor signals.
     """
 
     __slots__ = NO_EXTRA_SLOTS

@@ -48,10 +48,10 @@ class LoadEstimatorConfig:
 
 
 class LoadEstimator(LeafSystem):
-    """Block with the estimate of load and offsets: constant, updated in every period or monitored.
+    """Block that outputs load and offsets: constant, estimated from all samples, or monitored.
 
-    Ports are those of `blocks.LoadEstimator`, but one input `sample` replaces the separate signals
-    of the wrist sensor. load_state is an index into `load.online.watched.LOAD_STATE_NAMES`.
+    Ports as `blocks.LoadEstimator`, with one input `sample` for all sensor signals. Output
+    load_state is an index into `load.online.watched.LOAD_STATE_NAMES`.
 
     Args:
         noise_std: (6,) standard deviations of the wrench channels, for weighting [N, N m].

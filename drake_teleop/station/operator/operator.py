@@ -265,7 +265,7 @@ class Operator(LeafSystem):
           the rendered force [N], trust in detecting contact, 0.1 to 1 (with a task)
 
     The intended motion is relative to the pose X_BE `start` (7,). A task requires training, the
-    slave's arm, and `tip` (6,), the position of the tool's tip in S and at the start in W [m].
+    slave's arm, and `tip` (6,): position of the tool's tip in S, and at the start in W [m].
     """
 
     __slots__ = NO_EXTRA_SLOTS
@@ -332,7 +332,7 @@ class Operator(LeafSystem):
         _update_operator_perception_and_decision(*self._task_parameters, *inputs, slave_q, *state)
 
     def _evaluate_intent(self, context: Context) -> tuple[Array, ...]:
-        """Return segments, the pose and twist they are relative to, and the decision memory."""
+        """Return packed motion segments, their reference pose and twist, and decision memory."""
         memory = self._no_memory
         if self._has_task:
             memory = context.get_discrete_state(self._groups[1]).value()

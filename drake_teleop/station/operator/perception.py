@@ -54,7 +54,7 @@ class Perception:
     aim_error: float = quantity(1e-3, "m", 0.0, 0.1, "standard deviation of perceived slot x and y")
 
     def packed_for_compiled_code(self, dt: float) -> Array:
-        """Return (4,): Weber fraction, threshold [N]; masking decay, low-pass gain per `dt` [s]."""
+        """Return Weber fraction, threshold [N], masking decay, low-pass gain per `dt` [s]."""
         fade = math.exp(-dt / self.masking_time)
         smooth = -math.expm1(-2 * math.pi * self.bandwidth_hz * dt)
         return np.array([self.weber_fraction, self.absolute_threshold, fade, smooth])

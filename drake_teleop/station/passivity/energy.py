@@ -19,7 +19,7 @@ def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
     Args:
         wrench: (N, 6) [f; tau], in W [N, N m].
         pose: (N, 7) pose of the body [qw qx qy qz px py pz], in W, at the same instants.
-        pair: wrench used from k-1 to k: `held` f_(k-1), `backward` f_k, or the `mean` of both.
+        pair: wrench between k-1 and k: "held" f_(k-1), "backward" f_k, or the "mean" of both.
     """
     if pair not in NEW_WRENCH_SHARES:
         remedy = f"choose one of {', '.join(NEW_WRENCH_SHARES)}"

@@ -104,7 +104,7 @@ class LedgerConfig:
 
 
 def initialize(p: Array, memory: Array) -> None:
-    """Store half the initial energy, and the command as servo-model pose, in one end's memory."""
+    """Store this end's half of the initial energy; start its servo model at the command."""
     memory[slots.STORED_ENERGY] = p[shared.INITIAL_LEDGER_ENERGY] / 2.0
     memory[shared.SERVO_MODEL_POSE] = memory[slots.COMMAND_POSE]
 
@@ -194,7 +194,7 @@ def _update_master_energy(g, dx, in_contact, p, memory):
 def _predict_contact_wrench_into(received, dx, T, p, memory, offset_to_slave, wrench):
     """Write the contact wrench predicted for the hand's pose (docs/theory.md, M2, M3) to `wrench`.
 
-    `offset_to_slave` (6,) is the pose of the hand minus the slave's pose [m, rad].
+    `offset_to_slave` (6,) is the hand's pose minus the slave's pose [m, rad].
     """
     contact_wrench, normal = received[fields.WRENCH], memory[shared.CONTACT_DIRECTION]
     inward = memory[_DIRECTION_INTO_WALL]
@@ -272,11 +272,11 @@ def _predict_contact_wrench_into(received, dx, T, p, memory, offset_to_slave, wr
 
 
 @njit(cache=True)
-def _render_friction(T, size, force, received, dx, p, memory, wrench):
+def _render_friction(T, slave_force, hand_force, received, dx, p, memory, wrench):
     """Write the friction to render at the hand into `wrench` (6,), docs/theory.md (T68).
 
-    It is modelled friction at the hand plus (measured - modelled) friction at the slave. `size` and
-    `force` are normal forces at slave and hand [N].
+    It is modelled friction at the hand plus (measured - modelled) friction at the slave.
+    `slave_force` and `hand_force` are normal forces [N].
     """
     near, far = memory[_MODEL_FRICTION_AT_HAND], memory[_MODEL_FRICTION_AT_SLAVE]
     rest, normal = memory[_UNMODELLED_FRICTION], memory[shared.CONTACT_DIRECTION]
@@ -289,9 +289,11 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
     for g in range(2):
         metric = max(p[shared.NORM_WEIGHTS_SLICE][g], _MIN_NORM_WEIGHT)
         spring, largest = _friction_stiffness(g, p), _MAX_FRICTION_COEFFICIENT / math.sqrt(metric)
-        cone[g] = max(cone[g] * (1.0 - decay), min(length_of_group(wrench, g) / size, largest))
+        cone[g] = max(
+            cone[g] * (1.0 - decay), min(length_of_group(wrench, g) / slave_force, largest)
+        )
         least = _MIN_FRICTION_RELAXATION_S
-        lag = cone[g] * size / (_MAX_WALL_STIFFNESS * _FRICTION_SLIP_SPEED)
+        lag = cone[g] * slave_force / (_MAX_WALL_STIFFNESS * _FRICTION_SLIP_SPEED)
         if g == 1:
             least = _FRICTION_TORQUE_RELAXATION_S
             lag = _FRICTION_TORQUE_RELAXATION_ROUND_TRIPS * round_trip
@@ -304,15 +306,15 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
     for friction in (near, far, rest):
         _remove_component_along_contact_direction(friction, p, memory)
     for g in range(2):
-        limit_group(far, g, cone[g] * size)
-        limit_group(near, g, cone[g] * force)
+        limit_group(far, g, cone[g] * slave_force)
+        limit_group(near, g, cone[g] * hand_force)
         metric = max(p[shared.NORM_WEIGHTS_SLICE][g], _MIN_NORM_WEIGHT)
         for i in range(3 * g, 3 * g + 3):
             across = dx[i] - step * metric * normal[i]
             wrench[i] = near[i] + rest[i] - _friction_stiffness(g, p) * across
     _remove_component_along_contact_direction(wrench, p, memory)
     for g in range(2):
-        limit_group(wrench, g, cone[g] * force)
+        limit_group(wrench, g, cone[g] * hand_force)
 
 
 @njit(cache=True)

@@ -78,7 +78,7 @@ _RENDERED_FORCE, _LAST_SPEED_INTO_WALL, _MAX_FRICTION_FORCE = _memory_slots.numb
 
 @njit(cache=True)
 def filter_own_velocity(twist, new_weight, memory):
-    """Low-pass filter `FILTERED_OWN_VELOCITY` in `memory`; `new_weight` is that of `twist`."""
+    """Low-pass filter the velocity of this end; `new_weight` is the weight of `twist` (6,)."""
     velocity = memory[FILTERED_OWN_VELOCITY]
     for i in range(6):
         velocity[i] += new_weight * (twist[i] - velocity[i])
@@ -99,7 +99,7 @@ def wrench_component_along(a, b, p):
 
 @njit(cache=True)
 def work_along(wrench, displacement):
-    """Return wrench (6,) times displacement (6,): work [J], or a length [m] for a unit wrench."""
+    """Return wrench (6,) times displacement (6,): work [J]; for a unit wrench a length [m]."""
     return dot_of_group(wrench, displacement, 0) + dot_of_group(wrench, displacement, 1)
 
 

@@ -66,10 +66,10 @@ _METHOD_PARAMETER_SLICE = _parameter_slots.rest()
 
 
 def own_memory() -> SlotAllocator:
-    """Return an allocator of the memory places of a method; they are 0 at the start."""
+    """Return an allocator of the part of an end's memory for its method, 0 at the start."""
     return SlotAllocator(MEMORY_SIZE, _METHOD_MEMORY_SLICE.start)
 
 
 def own_parameters() -> SlotAllocator:
-    """Return an allocator of the parameter places of a method."""
+    """Return an allocator of the part of the parameters for the method."""
     return SlotAllocator(NUM_PARAMETERS, _METHOD_PARAMETER_SLICE.start)

@@ -113,7 +113,7 @@ class PassivityConfig:
     """Method that keeps the station passive, and the parameters of each method.
 
     The servo's force on the slave is K (x_command - x) - D v. `charged_tdpa`, `two_layer`, `pspm`,
-    `ledger` and `four_channel` use K and D. `two_layer`, `ledger` and `retreat` use the mass.
+    `ledger` and `four_channel` use K, D; `two_layer`, `ledger` and limit `retreat` use the mass.
     """
 
     method: str = choice(
@@ -306,7 +306,7 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
 def record_command(steps, requested, command, pose, twist, p, memory):
     """Update the method's memory if the safe state changed the method's command.
 
-    `requested` (7,) is the method's command X_WS, `command` (7,) that of the safe state, which
-    `ledger` may change. Other arguments: see `slave_step`.
+    `requested` (7,) is the method's command X_WS, `command` (7,) that of the safe state; `ledger`
+    may change `command`. Other arguments: see `slave_step`.
     """
     _call_record(steps[2], requested, command, pose, twist, p, memory)

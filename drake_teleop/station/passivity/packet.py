@@ -103,7 +103,7 @@ def pose_difference_into(pose, reference, difference):
 
 @njit(cache=True)
 def move_pose_into(pose, displacement, out):
-    """Write the pose moved by a displacement (6,) e, [exp(e_r) R; p + e_p], into `out` (7,)."""
+    """Write `pose` (7,), moved by a displacement (6,) [translation; rotation vector], to `out`."""
     turn = vectors.quaternion_exponential((displacement[3], displacement[4], displacement[5]))
     q = normalized_quaternion(quaternion_product(turn, (pose[0], pose[1], pose[2], pose[3])))
     out[0], out[1], out[2], out[3] = q

@@ -1,7 +1,7 @@
 """Safe state of both ends of the channel for silence and faulty data; docs/delay.md.
 
 A sender is *healthy* while its inputs are finite and at most 1e6 in SI units. An end is *silent* if
-no new packet of a healthy sender came for `timeout` seconds, and at once if an end is not healthy.
+no new packet of a healthy sender came for `timeout` seconds, and at once if either is not healthy.
 """
 
 from __future__ import annotations
@@ -36,10 +36,9 @@ _LAST_COMMAND, _COMMAND_BEFORE_LAST = map(_slave_monitor_slots.vector, (7, 7))
 
 
 def initial_master_monitor(device_limits: Array | None = None) -> Array:
-    """Return the silence monitor's state (MASTER_MONITOR_SIZE,) of a silent master.
+    """Return the silence monitor's state (6,) of a master that has received no packet.
 
-    With `device_limits` (2,), the device's largest force and torque [N, N m], return the state in
-    normal operation instead.
+    With `device_limits` (2,), the largest force and torque [N, N m]: state in normal operation.
     """
     state = np.zeros(MASTER_MONITOR_SIZE)
     if device_limits is None:
@@ -51,7 +50,7 @@ def initial_master_monitor(device_limits: Array | None = None) -> Array:
 
 
 def initial_slave_monitor(pose: Array) -> Array:
-    """Return the silence monitor's state (SLAVE_MONITOR_SIZE,) of a slave at rest at `pose`."""
+    """Return the silence monitor's state (30,) of a slave at rest at `pose`."""
     state = np.zeros(SLAVE_MONITOR_SIZE)
     state[SILENCE_TIME_INDEX] = np.inf
     state[_COMMAND_POSE_AT_STOP] = state[_LAST_COMMAND] = state[_COMMAND_BEFORE_LAST] = pose
@@ -95,8 +94,7 @@ def master_wrench_limits_into(healthy, fault, T, timeout, device_limits, display
 def slave_command_into(healthy, fault, T, timeout, requested, state, command):
     """Write the slave's command X_WS (7,): `requested`, or during silence a braking motion.
 
-    `requested` (7,) is the passivity method's command. Other arguments are those of
-    `master_wrench_limits_into`.
+    `requested` (7,) is the method's command; for others see `master_wrench_limits_into`.
     """
     _update_silence_time(healthy, fault, T, state)
     last, before = state[_LAST_COMMAND], state[_COMMAND_BEFORE_LAST]
@@ -134,8 +132,8 @@ def slave_command_into(healthy, fault, T, timeout, requested, state, command):
 def fade_retreat_wrench(twist, T, p, memory, wrench):
     """Reduce a wrench (6,) that pushes the hand, so that a released stylus stays slow.
 
-    Force and torque fall to 0 for hand speeds along them from `FORCE_FADE_HAND_SPEED` to twice
-    this, but not below `SLAVE_MASS` times the hand's deceleration. `memory` stores the new wrench.
+    Force and torque fall to 0 at twice the permitted hand speed (parameter `retreat`), but not
+    below the slave's mass times the hand's deceleration. `memory` stores the new wrench.
     """
     velocity, rate = memory[slots.FILTERED_HAND_VELOCITY], min(T / _HAND_VELOCITY_FILTER_S, 1.0)
     for i in range(6):

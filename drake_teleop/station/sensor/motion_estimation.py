@@ -97,7 +97,7 @@ def steady_state_kalman_gains(
 ) -> Array:
     """Return Kalman gains (3,) from innovation to position [1], rate [1/s], acceleration [1/s^2].
 
-    The filter has a measured position, and a measured acceleration with a drifting error.
+    The filter fuses a measured position and a measured acceleration with a drifting error.
 
     Args:
         position_std: standard deviation of a measured position, in any unit.
@@ -253,10 +253,10 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
 
 @njit(cache=True)
 def measure_sample_into(sensor, arm, noise, truth, chain_memory, estimator_memory, sample):
-    """Write the `sample` (`load.regressor`) that sensor chain and motion estimator make of `truth`.
+    """Write the wrist sensor's `sample` of the true values `truth`, once per period.
 
-    Implausible values flag the last sample instead. `sensor` is (constants of the chain, constants
-    of the estimator, ideal). Others: see `read_sensor_into`.
+    If `truth` is implausible, keep the last sample and flag it. `sensor` contains the constants of
+    sensor chain and estimator, and whether the sensor is ideal. Others: see `read_sensor_into`.
     """
     chain, estimator, ideal = sensor
     flag = regressor.SATURATION_FLAG_INDEX

@@ -1,7 +1,7 @@
 """Wrist sensor at a weld of any MultibodyPlant, continuous or discrete.
 
-If the plant samples its output ports, reaction and acceleration belong to the state before a step.
-The block stores pose and velocity of that state, so that a sample has the values of one instant.
+A plant with sampled outputs returns reaction and acceleration of the state before a step. The block
+stores pose and velocity of that state for each sample.
 """
 
 from __future__ import annotations
@@ -78,8 +78,8 @@ def AddWristSensor(
     """Add a wrist sensor to a finalized plant of this builder, and connect it.
 
     Args:
-        joint_or_frame: weld between arm and tool; S is then its frame on the arm. Or S itself, a
-            frame on a body of the arm with exactly one weld to a body beyond it.
+        joint_or_frame: weld between arm and tool, whose frame on the arm becomes S; or frame S on
+            a body of the arm with exactly one weld to a body beyond it.
         config: errors of the sensor; None for an ideal sensor.
         period: sampling period [s]; a multiple of a discrete plant's time step, by default equal
             to it, or 1 ms for a continuous plant.
@@ -322,10 +322,10 @@ def _arm_body_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyInde
 def _weld_properties(
     plant: MultibodyPlant, S: Frame, joint: WeldJoint
 ) -> tuple[int, int, tuple[Array | float, ...]]:
-    """Return reaction index and body index (body B of S) in the plant's ports, and geometry.
+    """Return indices of the weld's reaction and of S's body B in the plant's ports, and constants.
 
-    The geometry is p_BoSo_B, R_BS, R_SJc (Jc: frame of the reaction), p_SoJc_S, gravity in W, and
-    the sign from the reaction to the load's wrench.
+    These are p_BoSo_B, R_BS, R_SJc and p_SoJc_S (reaction frame Jc), gravity in W, sign of the
+    reaction.
     """
     arm, load = _arm_body_and_load(plant, joint)
     if not sum(plant.get_body(body).default_mass() for body in load) > 0.0:

@@ -246,7 +246,7 @@ def calibration_matrices(config: WristSensorConfig) -> tuple[Array, Array, Array
     """Return random matrices from true values to values with calibration errors.
 
     They are (6, 6) for [f; tau] in S, (3, 3) for specific force and (3, 3) for angular acceleration
-    in A. The seed is `config.unit`.
+    in A. `config.unit` is their seed.
     """
     random = np.random.default_rng(config.unit)
     gains, talk = random.uniform(-1, 1, 6), random.uniform(-1, 1, (6, 6))
@@ -283,10 +283,7 @@ _DELAYED_ANGLES_START = _NUM_NOISY_CHANNELS + 2
 def initialize_sensor_chain(
     config: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[Records, Array]:
-    """Return constants and initial memory of `read_sensor_into` for an arm with n joints.
-
-    `constants[0].offset[:6]` is the wrench's offset [N, N m]; `memory[0]` counts samples.
-    """
+    """Return constants and initial memory of `read_sensor_into`."""
     if config.ideal:
         config = without_parts(config, *DISABLED_PART_VALUES)
     wrench, force, angular = calibration_matrices(config)
@@ -390,7 +387,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
 
 @njit(cache=True)
 def shift_delay_line(line):
-    """Shift the rows of the delay line by one; row 0 becomes free."""
+    """Copy each row of the delay line to the next one; row 0 is then to be overwritten."""
     for k in range(line.shape[0] - 1, 0, -1):
         copy_into(line[k], 0, line[k - 1], 0, line.shape[1])
 
