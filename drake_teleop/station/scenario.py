@@ -45,7 +45,7 @@ ENVIRONMENTS: Registry[type[Environment]] = Registry(
 )
 """Classes of the objects in `environment` by the tag in a file, without its `!`."""
 #: Longest fixed step in contact [s]: ball and leaf vibrate at up to 700 Hz.
-_MAX_STEP_IN_CONTACT_S = 1.25e-4
+_MAX_FIXED_STEP_S = 1.25e-4
 _MIN_KINEMATIC_SCALE_WITH_PASSIVITY = 1e-4  # 0.1 um at the slave for 1 mm at the hand
 
 
@@ -304,9 +304,9 @@ def _check_operator_task(scenario: Scenario, where: str) -> None:
 def _check_integration_step(scenario: Scenario, where: str) -> None:
     simulation = scenario.simulation
     fixed = simulation.integrator != "runge_kutta3"
-    if scenario.surroundings is not None and fixed and simulation.max_step > _MAX_STEP_IN_CONTACT_S:
+    if scenario.surroundings is not None and fixed and simulation.max_step > _MAX_FIXED_STEP_S:
         what = f"fixed steps of {simulation.max_step:g} s are too long for contact"
-        remedy = f"set it to {_MAX_STEP_IN_CONTACT_S:g}, or integrator: runge_kutta3"
+        remedy = f"set it to {_MAX_FIXED_STEP_S:g}, or integrator: runge_kutta3"
         raise DrakeTeleopError(what, where=f"{where}:simulation.max_step", remedy=remedy)
 
 

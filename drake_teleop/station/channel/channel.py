@@ -25,7 +25,7 @@ from drake_teleop.station.stepped_block import SteppedBlock
 _NETWORK_NAMES = ("custom", *PRESETS)
 #: Smallest default and largest timeout [s].
 MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.1, 1.0
-_TIMEOUT_OVER_LONGEST_SILENCE = 1.5  # default timeout over the longest silence of a minute
+_TIMEOUT_TO_SILENCE_RATIO = 1.5  # default timeout over the longest silence of a minute
 
 
 @settings
@@ -61,7 +61,7 @@ class Channel(NetworkConfig):
             return self.timeout
         lines = enumerate(self.networks_of_directions())
         longest = max(network.longest_silence(line, k, period) for k, line in lines)
-        return min(max(_TIMEOUT_OVER_LONGEST_SILENCE * longest, MIN_TIMEOUT_S), MAX_TIMEOUT_S)
+        return min(max(_TIMEOUT_TO_SILENCE_RATIO * longest, MIN_TIMEOUT_S), MAX_TIMEOUT_S)
 
 
 # State of both ends in one array.

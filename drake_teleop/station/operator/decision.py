@@ -67,7 +67,7 @@ OperatorParameters = namedtuple(
 #: Task for compiled code: times, target in W relative to the tool's start, criteria.
 TaskParameters = namedtuple(
     "TaskParameters",
-    "kind start_time timeout goal approach_axis radius dwell standoff force tolerance depth",
+    "kind start_time timeout target_W approach_axis radius dwell standoff force tolerance depth",
     defaults=(0.0, 0.0, 0.0, 0.0),
 )
 
@@ -258,7 +258,7 @@ def _perceived_standoff_target_W(task, person):
     depth = 0.0
     if task.kind != tasks.KIND_REACH:
         depth = person.depth_error * _normal_random_number(person, 0, 15)
-    target = task.goal + (depth - task.standoff) * task.approach_axis
+    target = task.target_W + (depth - task.standoff) * task.approach_axis
     if task.kind == tasks.KIND_INSERT:
         for i in range(2):
             target[i] += person.aim_error * _normal_random_number(person, 0, 13 + i)

@@ -50,8 +50,7 @@ def force_without_slip_steps(rendered, measured, explained_change, removed_share
 def force_change_by_slip(force_change, elastic_change, max_change):
     """Return the part of a force change [N] that no elastic contact explains.
 
-    An elastic contact changes the force by 0 to `elastic_change`. The result is at most
-    `max_change`.
+    An elastic contact causes 0 to `elastic_change`. The result is at most `max_change`.
     """
     elastic = min(max(force_change, min(elastic_change, 0.0)), max(elastic_change, 0.0))
     return min(max(force_change - elastic, -max_change), max_change)

@@ -289,9 +289,8 @@ def _render_friction(T, slave_force, hand_force, received, dx, p, memory, wrench
     for g in range(2):
         metric = max(p[shared.NORM_WEIGHTS_SLICE][g], _MIN_NORM_WEIGHT)
         spring, largest = _friction_stiffness(g, p), _MAX_FRICTION_COEFFICIENT / math.sqrt(metric)
-        cone[g] = max(
-            cone[g] * (1.0 - decay), min(length_of_group(wrench, g) / slave_force, largest)
-        )
+        ratio = length_of_group(wrench, g) / slave_force
+        cone[g] = max(cone[g] * (1.0 - decay), min(ratio, largest))
         least = _MIN_FRICTION_RELAXATION_S
         lag = cone[g] * slave_force / (_MAX_WALL_STIFFNESS * _FRICTION_SLIP_SPEED)
         if g == 1:

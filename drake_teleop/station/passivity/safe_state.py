@@ -23,16 +23,16 @@ MASTER_MONITOR_SIZE, SLAVE_MONITOR_SIZE = 6, 30  #: lengths of the monitor state
 # Monitor state of the master.
 _master_monitor_slots = slots.SlotAllocator(MASTER_MONITOR_SIZE)
 SILENCE_TIME_INDEX = _master_monitor_slots.number()  #: time without packets [s], also at the slave
-_PRESENT_HAND_WRENCH_LIMITS = _master_monitor_slots.vector(2)  # present limits
-_WRENCH_LIMIT_FALL_RATE = _master_monitor_slots.vector(2)  # their decrease per second
+_WRENCH_LIMITS_SLICE = _master_monitor_slots.vector(2)  # present limits
+_LIMIT_FALL_RATES_SLICE = _master_monitor_slots.vector(2)  # their decrease per second
 _CONNECTED_TIME = _master_monitor_slots.number()  # time since the last silence
 # Monitor state of the slave.
 _slave_monitor_slots = slots.SlotAllocator(SLAVE_MONITOR_SIZE, SILENCE_TIME_INDEX + 1)
-_TIME_SINCE_STOP_BEGAN = _slave_monitor_slots.number()  # time since it began to stop
-_TIME_SINCE_RESUME_BEGAN = _slave_monitor_slots.number()  # time since it began to resume
-_COMMAND_POSE_AT_STOP = _slave_monitor_slots.vector(7)  # command when it began to stop
-_COMMAND_VELOCITY_AT_STOP_START = _slave_monitor_slots.vector(6)  # its velocity
-_LAST_COMMAND, _COMMAND_BEFORE_LAST = map(_slave_monitor_slots.vector, (7, 7))
+_STOPPING_TIME_INDEX = _slave_monitor_slots.number()  # time since it began to stop
+_RESUMING_TIME_INDEX = _slave_monitor_slots.number()  # time since it began to resume
+_STOP_POSE_SLICE = _slave_monitor_slots.vector(7)  # command when it began to stop
+_STOP_VELOCITY_SLICE = _slave_monitor_slots.vector(6)  # its velocity
+_LAST_COMMAND_SLICE, _EARLIER_COMMAND_SLICE = map(_slave_monitor_slots.vector, (7, 7))
 
 
 def initial_master_monitor(device_limits: Array | None = None) -> Array:
@@ -44,7 +44,7 @@ def initial_master_monitor(device_limits: Array | None = None) -> Array:
     if device_limits is None:
         state[SILENCE_TIME_INDEX] = np.inf
     else:
-        state[_PRESENT_HAND_WRENCH_LIMITS] = device_limits
+        state[_WRENCH_LIMITS_SLICE] = device_limits
         state[_CONNECTED_TIME] = RESUME_TIME_S
     return state
 
@@ -53,7 +53,7 @@ def initial_slave_monitor(pose: Array) -> Array:
     """Return the silence monitor's state (30,) of a slave at rest at `pose`."""
     state = np.zeros(SLAVE_MONITOR_SIZE)
     state[SILENCE_TIME_INDEX] = np.inf
-    state[_COMMAND_POSE_AT_STOP] = state[_LAST_COMMAND] = state[_COMMAND_BEFORE_LAST] = pose
+    state[_STOP_POSE_SLICE] = state[_LAST_COMMAND_SLICE] = state[_EARLIER_COMMAND_SLICE] = pose
     return state
 
 
@@ -75,7 +75,7 @@ def master_wrench_limits_into(healthy, fault, T, timeout, device_limits, display
     _update_silence_time(healthy, fault, T, state)
     connected = state[SILENCE_TIME_INDEX] <= timeout
     state[_CONNECTED_TIME] = min(state[_CONNECTED_TIME] + T, RESUME_TIME_S) if connected else 0.0
-    present, fall = state[_PRESENT_HAND_WRENCH_LIMITS], state[_WRENCH_LIMIT_FALL_RATE]
+    present, fall = state[_WRENCH_LIMITS_SLICE], state[_LIMIT_FALL_RATES_SLICE]
     for g in range(2):
         size, limit = length_of_group(displayed, g), present[g]
         if connected:
@@ -97,28 +97,28 @@ def slave_command_into(healthy, fault, T, timeout, requested, state, command):
     `requested` (7,) is the method's command; for others see `master_wrench_limits_into`.
     """
     _update_silence_time(healthy, fault, T, state)
-    last, before = state[_LAST_COMMAND], state[_COMMAND_BEFORE_LAST]
-    start, velocity = state[_COMMAND_POSE_AT_STOP], state[_COMMAND_VELOCITY_AT_STOP_START]
+    last, before = state[_LAST_COMMAND_SLICE], state[_EARLIER_COMMAND_SLICE]
+    start, velocity = state[_STOP_POSE_SLICE], state[_STOP_VELOCITY_SLICE]
     step = np.empty(6)
     if state[SILENCE_TIME_INDEX] <= timeout:
-        state[_TIME_SINCE_RESUME_BEGAN] = min(state[_TIME_SINCE_RESUME_BEGAN] + T, RESUME_TIME_S)
-    elif state[_TIME_SINCE_RESUME_BEGAN] > 0.0:
+        state[_RESUMING_TIME_INDEX] = min(state[_RESUMING_TIME_INDEX] + T, RESUME_TIME_S)
+    elif state[_RESUMING_TIME_INDEX] > 0.0:
         fields.pose_difference_into(last, before, velocity)
         for i in range(6):
             velocity[i] /= T
         copy_into(start, 0, last, 0, 7)
-        state[_TIME_SINCE_STOP_BEGAN] = state[_TIME_SINCE_RESUME_BEGAN] = 0.0
-    if state[_TIME_SINCE_RESUME_BEGAN] == RESUME_TIME_S:
+        state[_STOPPING_TIME_INDEX] = state[_RESUMING_TIME_INDEX] = 0.0
+    if state[_RESUMING_TIME_INDEX] == RESUME_TIME_S:
         copy_into(command, 0, requested, 0, 7)
     else:
         # A blend from the stopping motion to the requested command keeps the velocity continuous
         # even if the end resumes before it has stopped.
-        state[_TIME_SINCE_STOP_BEGAN] += T
-        u = min(state[_TIME_SINCE_STOP_BEGAN] / STOP_TIME_S, 1.0)
+        state[_STOPPING_TIME_INDEX] += T
+        u = min(state[_STOPPING_TIME_INDEX] / STOP_TIME_S, 1.0)
         for i in range(6):  # velocity falls as 1 - 3 u^2 + 2 u^3
             step[i] = velocity[i] * STOP_TIME_S * u * (1.0 - u * u * (1.0 - 0.5 * u))
         move_pose_into(start, step, command)
-        u = state[_TIME_SINCE_RESUME_BEGAN] / RESUME_TIME_S
+        u = state[_RESUMING_TIME_INDEX] / RESUME_TIME_S
         if u > 0.0:
             fields.pose_difference_into(requested, command, step)
             for i in range(6):

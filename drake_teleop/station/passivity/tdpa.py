@@ -18,9 +18,9 @@ from drake_teleop.station.passivity import packet as fields
 from drake_teleop.station.passivity.packet import dot_of_group, length_of_group, limit_group
 
 # Share of the hand's input kept until the reserve is full; all of it would starve a soft wall.
-_KEPT_HAND_ENERGY_SHARE = 0.5
+_UNSENT_HAND_ENERGY_SHARE = 0.5
 # Onset and end of a wrench that needs no delay filter: slower than hand and servo [s].
-_WRENCH_ONSET_FILTER_S = 0.1
+_WRENCH_ONSET_TIME_CONSTANT_S = 0.1
 _CONTACT_END_WRENCH_RATIO = 0.1  # a wrench below this share of the filtered one ends
 _WRENCH_SHARE_AT_ONSET_END = 0.98  # share at which a quick onset is complete
 # Travel over which the contact stiffness is averaged [m, rad], and speed below which the drag fades
@@ -146,7 +146,7 @@ def _subtract_hand_work_of_group(g, work_on_hand, p, memory):
         ledger[g] = max(ledger[g] - work_on_hand, 0.0)
     else:
         missing = max(p[_TARGET_RESERVE][g] - kept[g], 0.0)
-        more = min(-_KEPT_HAND_ENERGY_SHARE * work_on_hand, missing)
+        more = min(-_UNSENT_HAND_ENERGY_SHARE * work_on_hand, missing)
         memory[slots.SENT_ENERGY][g] -= work_on_hand + more
     kept[g] = max(kept[g] + more, 0.0)
 
@@ -185,7 +185,7 @@ def _filter_returned_wrench_of_group(g, received, dx, wrench, T, p, memory):
         round_trip = max(memory[slots.STEP_COUNT] - received[_NEWEST_MASTER_PACKET_NUMBER], 1.0) * T
         lag = round_trip + p[slots.SERVO_D][g] / p[slots.SERVO_K][g]
         size, filtered_size = length_of_group(wrench, g), length_of_group(filtered, g)
-        onset_rate = min(T / _WRENCH_ONSET_FILTER_S, 1.0)
+        onset_rate = min(T / _WRENCH_ONSET_TIME_CONSTANT_S, 1.0)
         rate = min(T / (lag * (1.0 + math.e * gain)), 1.0)
         if size < _CONTACT_END_WRENCH_RATIO * filtered_size:
             rate = max(rate, onset_rate)
@@ -194,7 +194,7 @@ def _filter_returned_wrench_of_group(g, received, dx, wrench, T, p, memory):
                 onset = onset_rate
                 memory[_QUICK_ONSET_PACKET_NUMBER][g] = memory[slots.STEP_COUNT]
             awaited = received[_NEWEST_MASTER_PACKET_NUMBER] < memory[_QUICK_ONSET_PACKET_NUMBER][g]
-            if lag > _WRENCH_ONSET_FILTER_S and awaited:
+            if lag > _WRENCH_ONSET_TIME_CONSTANT_S and awaited:
                 rate = 0.0
     for i in range(3 * g, 3 * g + 3):
         now = filtered[i]

@@ -18,7 +18,7 @@ _parameter_slots = slots.own_parameters()
 _SEND_RATE, _MAX_TANK_DRAIN_RATE = _parameter_slots.numbers(2)
 _INITIAL_TANK_ENERGY, _TARGET_TANK_LEVEL, _TANK_CAPACITY = map(_parameter_slots.vector, [2] * 3)
 _DAMPING_PER_MISSING_ENERGY, MAX_PORT_ACCELERATION = map(_parameter_slots.vector, (2, 2))
-_RESERVE_PER_CAPACITY = 0.01  # share of the capacity
+_RESERVE_TANK_SHARE = 0.01  # share of the capacity
 # Memory of the slave: wrench of the spring, wrench of the damper.
 _memory_slots = slots.own_memory()
 _SERVO_SPRING_WRENCH, _SERVO_DAMPER_WRENCH = map(_memory_slots.vector, (6, 6))
@@ -67,7 +67,7 @@ def _update_tank_and_send_energy(received, dx, T, p, memory, packet):
     for g in range(2):
         level = ledger[g] - dot_of_group(held, dx, g)
         level += fields.count_newly_received_energy(g, received, memory)
-        sent = min(T * p[_SEND_RATE], 1.0) * max(level - _RESERVE_PER_CAPACITY * capacity[g], 0.0)
+        sent = min(T * p[_SEND_RATE], 1.0) * max(level - _RESERVE_TANK_SHARE * capacity[g], 0.0)
         level -= sent
         lost = max(level - capacity[g], 0.0)
         sent_so_far[g] += sent
@@ -122,7 +122,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
             motor_wrench[i] = spring[i] + brake[i]
         mass, own_acceleration = p[slots.SLAVE_MASS][g], p[MAX_PORT_ACCELERATION][g]
         # The spring is shortened first and leaves the reserve, so that an empty tank can brake.
-        kept = _RESERVE_PER_CAPACITY * p[_TANK_CAPACITY][g]
+        kept = _RESERVE_TANK_SHARE * p[_TANK_CAPACITY][g]
         available = max(memory[slots.STORED_ENERGY][g] - kept, 0.0)
         acceleration = own_acceleration + length_of_group(motor_wrench, g) / mass
         if _max_work_in_period_of_group(motor_wrench, dx, g, acceleration, T) > available:

@@ -111,7 +111,7 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
     truth = np.empty(15 + n)
     v, vdot = x[half : half + n], xdot[half : half + n]
     true_sample_into(arm, phi, x[:n], v, vdot, wrench_W, truth)
-    copy_into(truth, sensor_chain.TRUE_JOINT_ANGLES.start, x, 0, n)
+    copy_into(truth, sensor_chain.TRUE_ANGLES_SLICE.start, x, 0, n)
     size = regressor.FIRST_JOINT_INDEX + n
     copy_into(memory, size, memory, 0, size)
     filters = memory[2 * size : middle], memory[middle:end]
@@ -129,7 +129,7 @@ def append_step_to_queue(queue, time, state, surroundings):
 
 
 @njit(cache=True, omits_reference_counting=True)
-def _try_append_step(memory, queue_start, max_steps, time, state, surroundings):
+def _append_if_space(memory, queue_start, max_steps, time, state, surroundings):
     if memory[queue_start + 1] >= max_steps:
         return False
     append_step_to_queue(memory[queue_start:], time, state, surroundings)
@@ -345,7 +345,7 @@ class WristSensor(LeafSystem):
         """Indices of the numbers of this block's discrete state that depend on the motion."""
         _, chain_end, end = self._sensor
         size = regressor.sample_size(self._n)
-        before_and_walks = range(size, 2 * size + sensor_chain.FILTER_MEMORY_START)
+        before_and_walks = range(size, 2 * size + sensor_chain.FILTER_START_INDEX)
         others = [regressor.SATURATION_FLAG_INDEX, *before_and_walks, chain_end, chain_end + 1]
         return np.delete(np.arange(end), others)
 
@@ -424,7 +424,7 @@ class WristSensor(LeafSystem):
             monitored = self._monitored_pairs.size
             if not monitored or self._classify_tool_proximity(*seen) != PROXIMITY_NEAR_MONITORED:
                 memory = discrete_state.get_mutable_value(0)
-                if _try_append_step(memory, self._sensor[2], self._max_queued_steps, time, *seen):
+                if _append_if_space(memory, self._sensor[2], self._max_queued_steps, time, *seen):
                     return
         discrete_state.set_value(0, self._step.Eval(context)[self._memory_slice])
 
