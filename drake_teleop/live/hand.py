@@ -152,7 +152,7 @@ class LiveHand(operator.Operator):
         super().__init__(dataclasses.replace(config, intent=[], task=None), start)
         self._scratch, self._mass = np.empty(_NUM_INTENDED_MOTION_VALUES), config.hand.mass
 
-    def _declare_intended_motion_sources(self) -> set[framework.DependencyTicket]:
+    def _declare_intended_motion_ports(self) -> set[framework.DependencyTicket]:
         path = np.zeros(_PATH_SIZE)
         path[_IS_HELD_INDEX], path[_POLE_INDEX] = 1.0, _TRANSLATION_POLE_RAD_S
         path[_TARGET_POSE_INDEX:_OFFSET_INDEX] = self._intent[1]

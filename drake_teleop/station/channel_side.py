@@ -52,7 +52,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         return builder.Build()
     scaling = scenario.kinematic_scaling
     R_WB, scales = scaling.R_WB, scaling.scales
-    passivity, start = _passivity_config_for_arm_and_device(scenario), start_pose(scenario.slave)
+    passivity, start = _passivity_with_mass_and_encoder_step(scenario), start_pose(scenario.slave)
     gain, period = _rendered_force_per_contact_force(scenario), 1 / scenario.rates.hand_hz
     seed = scenario.simulation.seed
     block = TeleopChannel(scenario.channel, passivity, R_WB, scales, gain, start, period, seed)
@@ -68,7 +68,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
     return builder.Build()
 
 
-def _passivity_config_for_arm_and_device(scenario: Scenario) -> PassivityConfig:
+def _passivity_with_mass_and_encoder_step(scenario: Scenario) -> PassivityConfig:
     passivity, device = passivity_config_with_arm_mass(scenario), scenario.master.device(0.0, 0.0)
     ledger = passivity.ledger
     if ledger.encoder_step is None:
@@ -85,7 +85,7 @@ def _passivity_config_for_arm_and_device(scenario: Scenario) -> PassivityConfig:
 def passivity_config_with_arm_mass(scenario: Scenario) -> PassivityConfig:
     """Return passivity settings, with the arm's mass and servo if `ledger` has no `slave_mass`.
 
-    An arm with fewer than six joints raises a DrakeTeleopError then: its mass is unbounded.
+    Then an arm with fewer than six joints raises a DrakeTeleopError.
     """
     passivity = scenario.passivity
     if not METHODS[passivity.method].needs_arm_mass or passivity.slave_mass is not None:
@@ -102,13 +102,13 @@ def passivity_config_with_arm_mass(scenario: Scenario) -> PassivityConfig:
     )
 
 
-def slave_wrench_power_scale(scenario: Scenario) -> Array:
-    """Return factors (2,) from slave wrench to master's power units (T29): force, torque."""
+def slave_to_master_power_unit_scale(scenario: Scenario) -> Array:
+    """Return factors (2,) for force and torque that equate work at slave and hand (T29)."""
     scales = scenario.kinematic_scaling.scales
     return _rendered_force_per_contact_force(scenario) / np.where(scales > 0.0, scales, 1.0)
 
 
 def _rendered_force_per_contact_force(scenario: Scenario) -> float:
-    """Return rendered over measured contact force, with 1 for a scale of 0."""
+    """Return rendered over measured contact force; scales of 0 count as 1."""
     scaling = scenario.force_scaling
     return (scaling.force_scale or 1.0) * (scaling.scales().gamma or 1.0)

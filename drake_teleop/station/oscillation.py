@@ -34,7 +34,7 @@ _MAX_TOUCH_TO_COMMAND_REVERSAL_S = 0.1
 
 
 def reversal_indices(x: Array, min_swing: float) -> NDArray[np.intp]:
-    """Return indices of maxima and minima of x (N,); neighbours differ by > `min_swing`."""
+    """Return indices of alternate maxima and minima of x (N,) more than `min_swing` apart."""
     slope = np.diff(x)
     near = np.flatnonzero(slope[1:] * slope[:-1] <= 0.0) + 1
     found: list[int] = []
@@ -57,7 +57,7 @@ def flag_unexplained_oscillation(
     """Return (N,) flags: True while the actual motion oscillates and the command does not.
 
     An oscillation has at least four reversals larger than `swing`, each within 0.5 s of the
-    previous one. Each command reversal removes the nearest motion reversal within `window` [s].
+    previous one. The nearest reversal within `window` [s] of a command reversal is not counted.
 
     Args:
         t: (N,) times [s].
@@ -78,7 +78,7 @@ def flag_pose_oscillation(
 ) -> Flags:
     """Return (N,) flags: True while the actual pose (N, 7) oscillates and the command does not.
 
-    `swing` is 0.5 mm and 0.5 degrees; see `flag_unexplained_oscillation` for `window` [s].
+    Reversals exceed 0.5 mm or 0.5 degrees, and are `window` [s] from those of the command.
     """
     turned, wanted = (doubled_quaternions(pose, command) for pose in (actual, command))
     swaying = flag_unexplained_oscillation(t, command[:, 4:], actual[:, 4:], _MIN_SWING_M, window)
@@ -93,9 +93,9 @@ def pose_reversal_times(t: Array, pose: Array) -> Array:
 
 
 def doubled_quaternions(pose: Array, reference: Array) -> Array:
-    """Return twice the quaternions (N, 4) of a pose (N, 7); small differences are angles [rad].
+    """Return quaternions (N, 4) of poses (N, 7), times 2: small differences are angles [rad].
 
-    Their signs are those nearer to the quaternion of the pose `reference[0]`.
+    Each quaternion has the sign that is nearer to the pose `reference[0]`.
     """
     q: Array = pose[:, :4]
     return 2 * q * np.where(q @ reference[0, :4] < 0.0, -1.0, 1.0)[:, np.newaxis]

@@ -41,14 +41,14 @@ of the stylus, and the point (3,) [m] in it that the hand holds."""
 
 _TABLE_HEIGHT_M = 0.60
 # Origin of the haptic device's base frame B in W [m].
-_MASTER_BASE_P_WB_M = np.array([1.15, -0.10, _TABLE_HEIGHT_M + 0.28])  # B is 0.28 m above the foot
+_MASTER_BASE_POSITION_M = np.array([1.15, -0.10, _TABLE_HEIGHT_M + 0.28])  # 0.28 m above foot
 _CAMERA_P_W, _CAMERA_TARGET_W = np.array([0.80, -1.15, 0.92]), np.array([0.70, 0.0, 0.50])
 _CAMERA_SHIFT_WITHOUT_DEVICE_W_M = np.array([-0.3, 0.0, 0.0])  # of camera and target
 _FLOOR_COLOUR = Rgba(0.93, 0.94, 0.95)
 _WOOD_COLOUR = Rgba(0.78, 0.66, 0.50)
 _STEEL_COLOUR = Rgba(0.40, 0.43, 0.47)
-_HAND_GRIP_P_E_M = np.array([0.09, 0.0, 0.0])  # where the hand holds the stylus
-_SLAVE_WRIST_P_S_M = np.array([0.0, 0.0, -0.085])  # wrist of the arm
+_HAND_GRIP_POSITION_M = np.array([0.09, 0.0, 0.0])  # where the hand holds the stylus
+_SLAVE_WRIST_POSITION_M = np.array([0.0, 0.0, -0.085])  # wrist of the arm
 # Arrows inside arm and tool would be hidden.
 _WRIST_ARROW_OFFSET_W_M = np.array([0.07, -0.09, 0.0])
 _TIP_ARROW_OFFSET_W_M = np.array([-0.06, 0.0, 0.0])
@@ -122,7 +122,7 @@ def write_replay(
         scenario.description or "A run of the station",
         times,
         slow_motion,
-        displayed_numbers=_displayed_force_norms(signals),
+        displayed_numbers=_force_magnitudes_for_page(signals),
         shaded_spans=contact_spans(result.t, contact),
         notes=("Arrows: 3 mm per newton of the force at the slave.",),
         curves_label="forces, 0 to {top} N" + ("; contact shaded" if contact.any() else ""),
@@ -135,7 +135,7 @@ def write_replay(
     film.write(path, make_scene)
 
 
-def _displayed_force_norms(signals: Signals) -> list[replay_file.DisplayedNumber]:
+def _force_magnitudes_for_page(signals: Signals) -> list[replay_file.DisplayedNumber]:
     measured = signals["measured_wrench_S"][:, :3] - signals["load_estimate"][:, :3]
     forces = [("Measured at the wrist", measured, BLUE)]
     if "contact_wrench_S" in signals:
@@ -160,7 +160,7 @@ def _find_logs_of_run(run: Path) -> list[Path]:
     if not logs:
         remedy = "give a folder from drake-teleop run or reproduce, or a log.parquet; a study"
         remedy = f"{remedy} stores measures only: run one of its points as a scenario"
-        raise DrakeTeleopError("contains no log of a run", where=str(run), remedy=remedy)
+        raise DrakeTeleopError("the folder contains no log of a run", where=str(run), remedy=remedy)
     return logs
 
 
@@ -246,7 +246,7 @@ class ReplayScene:
     def _show_force_arrows(self, replay_time: float, signals: Signals, sample: int) -> None:
         X_WS = self._sensor.CalcPoseInWorld(self.context)
         places = {
-            "wrist": X_WS @ _SLAVE_WRIST_P_S_M + _WRIST_ARROW_OFFSET_W_M,
+            "wrist": X_WS @ _SLAVE_WRIST_POSITION_M + _WRIST_ARROW_OFFSET_W_M,
             "tip": X_WS @ self._tip + _TIP_ARROW_OFFSET_W_M,
         }
         if self._device is not None:
@@ -275,16 +275,16 @@ class ReplayScene:
 def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevice:
     if (leader := scenario.master.leader) is not None:
         order = np.argsort(leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index)
-        on_table = RigidTransform([*_MASTER_BASE_P_WB_M[:2], _TABLE_HEIGHT_M])
+        on_table = RigidTransform([*_MASTER_BASE_POSITION_M[:2], _TABLE_HEIGHT_M])
         arm = leader.add_to_plant(plant, on_table)
         return arm.instance, lambda q: q[order], arm.sensor_frame, np.zeros(3)
     is_phantom = scenario.master.model == PHANTOM_NAME
     name = "phantom" if is_phantom else "grip"
     (master,) = Parser(plant, "master").AddModels(str(files.models_dir() / f"{name}.sdf"))
     base = plant.GetFrameByName("base", master)
-    plant.WeldFrames(plant.world_frame(), base, RigidTransform(_MASTER_BASE_P_WB_M))
+    plant.WeldFrames(plant.world_frame(), base, RigidTransform(_MASTER_BASE_POSITION_M))
     to_plant_positions = serial_joint_angles if is_phantom else np.copy
-    return master, to_plant_positions, plant.GetFrameByName("stylus", master), _HAND_GRIP_P_E_M
+    return master, to_plant_positions, plant.GetFrameByName("stylus", master), _HAND_GRIP_POSITION_M
 
 
 def _draw_room_and_set_camera(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
@@ -294,7 +294,7 @@ def _draw_room_and_set_camera(meshcat: Meshcat, scenario: Scenario, *, with_tabl
 
     draw_box("floor", (8.0, 8.0, 0.02), (0.6, 0.5, -0.011), _FLOOR_COLOUR)
     if with_table:
-        x, y, _ = _MASTER_BASE_P_WB_M
+        x, y, _ = _MASTER_BASE_POSITION_M
         draw_box("table", (0.50, 0.60, 0.03), (x - 0.09, y, _TABLE_HEIGHT_M - 0.015), _WOOD_COLOUR)
         height = _TABLE_HEIGHT_M - 0.03
         for i, (dx, dy) in enumerate(((-0.31, -0.27), (-0.31, 0.27), (0.13, -0.27), (0.13, 0.27))):

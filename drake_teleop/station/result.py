@@ -193,7 +193,7 @@ class SimulationResult:
         """Return the wrist sensor's samples as a log for `identify` and `eliminate`.
 
         Columns ``t``, ``f_x`` ... ``tau_z``, ``s_x`` ..., ``omega_x`` ..., ``alpha_x`` ... in S and
-        SI units, with the sign of Eq. (1). Each sampling instant ``t`` has one row.
+        SI units; the wrench is that on the load. Each sampling instant ``t`` has one row.
         """
         import polars as pl
 
@@ -229,7 +229,7 @@ class SimulationResult:
         A part with the same `first_row` is replaced, except by an empty result.
 
         Args:
-            folder: folder of the log, prepared by `remove_log`.
+            folder: folder of the log.
             first_row: index of this result's first row in the whole log.
         """
         part = log_part_path(folder, first_row)
@@ -270,14 +270,14 @@ class SimulationResult:
         """
         from drake_teleop.common.style import Picture, plot_style, shade_contact
 
-        panels = [panel for name in names or self.signals for panel in self._panels_by_unit(name)]
+        panels = [panel for name in names or self.signals for panel in self._panels_per_unit(name)]
         with plot_style():
             figure = Picture(figsize=(8.0, 0.6 + 1.9 * len(panels)))
             rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
             for axes, (name, unit, indices) in zip(rows, panels, strict=True):
                 components, values = self._specs[name].components, self._values[name]
                 for index in indices:
-                    axes.plot(*_block_extremes(self._t, values[:, index]), label=components[index])
+                    axes.plot(*_row_extremes(self._t, values[:, index]), label=components[index])
                 if contact is not None:
                     shade_contact(axes, self._t, contact)
                 axes.set_title(name)
@@ -287,7 +287,7 @@ class SimulationResult:
             rows[-1].set_xlabel("t [s]")
         return figure
 
-    def _panels_by_unit(self, name: str) -> list[tuple[str, str, list[int]]]:
+    def _panels_per_unit(self, name: str) -> list[tuple[str, str, list[int]]]:
         if name in self._columns:
             signal, index = self._columns[name]
             return [(signal, self._specs[signal].units[index], [index])]
@@ -338,7 +338,7 @@ class _SignalsOnDisk(dict[str, Any]):
             return _read_only_view(_read_columns(self._path, columns))
 
 
-def _block_extremes(t: Array, values: Array) -> tuple[Array, Array]:
+def _row_extremes(t: Array, values: Array) -> tuple[Array, Array]:
     length = 2 * len(t) // _MAX_CURVE_POINTS
     if length < 2:
         return t, values

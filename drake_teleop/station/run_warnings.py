@@ -32,19 +32,19 @@ Warnings = Iterator[tuple[str, Spans, str]]
 _MIN_WARNING_SPAN_S = 0.2
 """Shortest reported duration [s]; a normal motion may cause shorter ones."""
 _MAX_GAP_OF_JOINED_SPANS_S = 0.05  # shorter gaps between time spans are closed
-_REACHED_LIMIT_SHARE = 1 - 1e-9  # share from which a limit counts as reached (rounding)
-_REACHED_MOTOR_LIMIT_SHARE = 0.999  # of a leader's motors, which the joints' motion changes
+_WARNED_LIMIT_SHARE = 1 - 1e-9  # share from which a limit counts as reached (rounding)
+_WARNED_MOTOR_LIMIT_SHARE = 0.999  # of a leader's motors, which the joints' motion changes
 # Smallest reported lag: command [m], orientation of the command [rad], joint [rad] (3 mm at 1 m).
 _MIN_WARNED_COMMAND_LAG_M = 2e-3
 _MIN_COMMAND_LAG_RAD, _MIN_JOINT_LAG_RAD = np.deg2rad(1.0), np.deg2rad(0.2)
 _LEDGER_COMMAND_SETTLING_TIME_S = 0.05  # with sufficient energy
 _DEGREES_PER_RAD = 180 / np.pi
 _MIN_JOINT_OSCILLATION_SWING_RAD = np.deg2rad(0.1)
-_SETTLING_TIME_IN_TIME_CONSTANTS = 6.0  # of the position loop, until the error is 0.3 %
+_JOINT_SETTLING_TIME_CONSTANTS = 6.0  # of the position loop, until the error is 0.3 %
 _MIN_INTENT_REST_S, _MAX_INTENT_REST_MOTION_M = 0.5, 1e-4
 _MIN_FORCE_OSCILLATION_CYCLES = 4
-_MIN_POWER_SHARE_OF_OSCILLATION = 0.5  # near its frequency; white noise has less than 0.3
-_MAX_RENDERED_SENSOR_NOISE_RMS_N = 2.0
+_MIN_POWER_SHARE_NEAR_PEAK = 0.5  # near its frequency; white noise has less than 0.3
+_ASSUMED_SENSOR_NOISE_RMS_N = 2.0
 _MAX_LISTED_SPANS = 3  # further time spans are counted
 _REDUCE_FORCE_ADVICE = "reduce force_scaling.gamma or force_scale"
 
@@ -52,7 +52,7 @@ _REDUCE_FORCE_ADVICE = "reduce force_scaling.gamma or force_scale"
 def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> list[str]:
     """Return a warning, with times, for each condition in docs/running.md that occurred.
 
-    Checks whose optional signals were not recorded are skipped. `arm` is the slave's arm.
+    Checks whose optional signals were not recorded are skipped.
     """
     overlaps, _ = start_overlap_texts(scenario.slave, scenario.surroundings)
     if not len(result.t):
@@ -84,9 +84,9 @@ def find_spans(t: Array, flags: Flags, min_duration: float = 0.0) -> Spans:
 
 
 def lag_beyond_delay(t: Array, command: Array, actual: Array, window: float) -> Array:
-    """Return distances (N,) of `actual` (N, k) from the range of `command` (N, k) before it.
+    """Return distances (N,) of `actual` (N, k) from the range of `command` (N, k) in a window.
 
-    The range covers the last `window` [s]: a pure delay gives 0. Times `t` [s] are evenly spaced.
+    The window is the last `window` [s]: a pure delay gives 0. Times `t` [s] are evenly spaced.
     """
     rows = max(round(window / (t[1] - t[0])), 1) + 1 if len(t) > 1 else 1
     above = actual - _trailing_maximum(command, rows)
@@ -123,7 +123,7 @@ def _check_reached_limits(result: SimulationResult, scenario: Scenario, arm: Arm
         error = command - result["slave_state"][:, : command.shape[1]]
         checked.insert(0, ("speed", control.position_loop_gain_per_s * error, fastest))
     for what, values, limit in checked:
-        clipped = np.abs(values) >= _REACHED_LIMIT_SHARE * limit
+        clipped = np.abs(values) >= _WARNED_LIMIT_SHARE * limit
         for joint in np.flatnonzero(clipped.any(axis=0)):
             spans, advice = find_spans(t, clipped[:, joint]), "use smaller or slower motions"
             yield f"joint {joint + 1} is at its largest {what}", spans, advice
@@ -131,12 +131,12 @@ def _check_reached_limits(result: SimulationResult, scenario: Scenario, arm: Arm
         shown, device = result["force_to_master"], scenario.master.device(0.0, 0.0)
         limits = device.parameters
         largest_force = limits.peak_force or np.inf  # 0: the device has no motors
-        full = np.linalg.norm(shown[:, :3], axis=1) >= _REACHED_LIMIT_SHARE * largest_force
+        full = np.linalg.norm(shown[:, :3], axis=1) >= _WARNED_LIMIT_SHARE * largest_force
         if isinstance(device, LeaderDevice):
-            reached = np.abs(shown[:, 3:]) >= _REACHED_LIMIT_SHARE * limits.peak_torque
+            reached = np.abs(shown[:, 3:]) >= _WARNED_LIMIT_SHARE * limits.peak_torque
             full |= reached.any(axis=1) & limits.peak_torque.all()
             joints = result["master_state"][:, : device.num_joints]
-            full |= device.flag_samples_at_motor_limit(joints, shown, _REACHED_MOTOR_LIMIT_SHARE)
+            full |= device.flag_samples_at_motor_limit(joints, shown, _WARNED_MOTOR_LIMIT_SHARE)
         elif limits.peak_torque.all():
             full |= _is_torque_at_limit(shown[:, 3:], result["master_state"], device)
         spans = find_spans(t, full, _MIN_WARNING_SPAN_S)
@@ -170,7 +170,7 @@ def _check_channel_silence_and_lag(result: SimulationResult, scenario: Scenario)
         late = f"up to {scale * largest:.1f} {unit} more than its delay explains,"
         advice = "move more slowly, or use another passivity method"
         yield f"the channel ({by}) delays the slave's command: {late}", spans, advice
-    yield from _check_speed_limit_of_energy_reserve(result, scenario)
+    yield from _check_speed_permitted_by_reserve(result, scenario)
     window += oscillation.COMMAND_REVERSAL_WINDOW_S
     oscillating = flag_pose_oscillation(t, sent, received, window)
     spans = find_spans(t, oscillating, _MIN_WARNING_SPAN_S)
@@ -178,14 +178,14 @@ def _check_channel_silence_and_lag(result: SimulationResult, scenario: Scenario)
     yield f"the channel ({by}) makes the slave's command oscillate", spans, advice
 
 
-def _check_speed_limit_of_energy_reserve(result: SimulationResult, scenario: Scenario) -> Warnings:
+def _check_speed_permitted_by_reserve(result: SimulationResult, scenario: Scenario) -> Warnings:
     speed_limit = METHODS[scenario.passivity.method].speed_limit
     if speed_limit is None or len(result.t) < 2:
         return
     t, sent, received = result.t, result["pose_command"], result["pose_received"]
     config, row = scenario.passivity.method_config(), t[1] - t[0]
     mass = np.array(channel_side.passivity_config_with_arm_mass(scenario).slave_mass)
-    limit = speed_limit(config, mass * channel_side.slave_wrench_power_scale(scenario))
+    limit = speed_limit(config, mass * channel_side.slave_to_master_power_unit_scale(scenario))
     forward, period = scenario.channel.networks_of_directions()[0], 1.0 / scenario.rates.hand_hz
     step = np.rint((t + scenario.simulation.settle) / period).astype(int)
     newest = newest_packets(forward, scenario.simulation.seed, FORWARD, step[-1] + 1, period)
@@ -217,6 +217,7 @@ def _check_speed_limit_of_energy_reserve(result: SimulationResult, scenario: Sce
 def _pose_parts_with_lag_limits(
     command: Array, actual: Array
 ) -> tuple[tuple[Array, Array, float, str, float], ...]:
+    """Return command, actual, largest lag, its unit and unit factor of position and rotation."""
     wanted, turned = (doubled_quaternions(pose, command) for pose in (command, actual))
     return (
         (command[:, 4:], actual[:, 4:], _MIN_WARNED_COMMAND_LAG_M, "mm", 1e3),
@@ -233,7 +234,7 @@ def _check_joint_tracking(result: SimulationResult, scenario: Scenario, arm: Arm
         return
     t, command = result.t, result["joint_command"]
     actual = result["slave_state"][:, : command.shape[1]]
-    window = _SETTLING_TIME_IN_TIME_CONSTANTS * scenario.joint_control.tracking_delay_s
+    window = _JOINT_SETTLING_TIME_CONSTANTS * scenario.joint_control.tracking_delay_s
     window += 1 / scenario.rates.joint_control_hz
     for k in range(command.shape[1]):
         far = lag_beyond_delay(t, command[:, [k]], actual[:, [k]], window)
@@ -299,8 +300,8 @@ def _check_rendered_force_oscillation(result: SimulationResult) -> Warnings:
     over_network = "ports" in result
     frequency, share = oscillation.dominant_frequency(t, part)
     largest_rms = _maximum_within_spans(t, rms, spans)
-    small = largest_rms < _MAX_RENDERED_SENSOR_NOISE_RMS_N
-    if not over_network and small and share < _MIN_POWER_SHARE_OF_OSCILLATION:
+    small = largest_rms < _ASSUMED_SENSOR_NOISE_RMS_N
+    if not over_network and small and share < _MIN_POWER_SHARE_NEAR_PEAK:
         return  # noise of the sensor
     ledger = ", or increase passivity.ledger.initial with ledger" if over_network else ""
     size = f"{frequency:.2g} Hz with up to {largest_rms:.2g} N rms"
@@ -309,7 +310,7 @@ def _check_rendered_force_oscillation(result: SimulationResult) -> Warnings:
 
 
 def _is_torque_at_limit(torque: Array, master_state: Array, device: HapticDevice) -> Flags:
-    full, peak = np.zeros(len(torque), bool), _REACHED_LIMIT_SHARE * device.parameters.peak_torque
+    full, peak = np.zeros(len(torque), bool), _WARNED_LIMIT_SHARE * device.parameters.peak_torque
     # A motor's torque is a component of the torque, so it is not larger.
     for k in np.flatnonzero(np.linalg.norm(torque, axis=1) >= peak.min()):
         turned = np.abs(torque[k] @ device.jacobian(master_state[k, :6])[3:, 3:])

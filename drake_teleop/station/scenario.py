@@ -45,7 +45,7 @@ ENVIRONMENTS: Registry[type[Environment]] = Registry(
 )
 """Classes of the objects in `environment` by the tag in a file, without its `!`."""
 #: Longest fixed step in contact [s]: ball and leaf vibrate at up to 700 Hz.
-_MAX_STEP_IN_CONTACT_S = 1.25e-4
+_MAX_FIXED_STEP_S = 1.25e-4
 _MIN_KINEMATIC_SCALE_WITH_PASSIVITY = 1e-4  # 0.1 um at the slave for 1 mm at the hand
 
 
@@ -54,15 +54,16 @@ _MIN_KINEMATIC_SCALE_WITH_PASSIVITY = 1e-4  # 0.1 um at the slave for 1 mm at th
 class Rates:
     """Sampling rates; in the paper: sensor 8 kHz, hand > 2 kHz, joint control 10 kHz."""
 
-    sensor_hz: float = quantity(8000.0, "Hz", 10.0, 1e5, "wrist sensor and encoders")
+    sensor_hz: float = quantity(8000.0, "Hz", 10.0, 1e5, "rate of wrist sensor and encoders")
     hand_hz: float = quantity(
-        2000.0, "Hz", 10.0, 1e5, "haptic device and channel; 1 kHz or more with a simulated device"
-    )
+        2000.0, "Hz", 10.0, 1e5,
+        "rate of haptic device and channel; 1 kHz or more with a simulated device",
+    )  # fmt: skip
     joint_control_hz: float = quantity(
-        2000.0, "Hz", 10.0, 1e5, "joint control of the slave; above 2 kHz, several samples a step"
+        2000.0, "Hz", 10.0, 1e5, "slave's joint control rate; above 2 kHz: several per event"
     )
-    estimator_hz: float = quantity(1000.0, "Hz", 10.0, 1e5, "load estimator and contact detection")
-    log_hz: float = quantity(1000.0, "Hz", 1.0, 1e5, "rows of the log")
+    estimator_hz: float = quantity(1000.0, "Hz", 10.0, 1e5, "rate of estimator and detection")
+    log_hz: float = quantity(1000.0, "Hz", 1.0, 1e5, "rate of log rows")
 
 
 @settings
@@ -75,7 +76,7 @@ class Simulation:
     """
 
     duration: float = quantity(1.0, "s", 1e-3, 36000.0, "logged time")
-    settle: float = quantity(0.5, "s", 0.0, 60.0, "time before the log starts, at t < 0")
+    settle: float = quantity(0.5, "s", 0.0, 60.0, "settling time before the log, at t < 0")
     integrator: str = choice(
         "runge_kutta3", ("runge_kutta3", "runge_kutta2", "semi_explicit_euler"), "Drake's scheme"
     )
@@ -84,7 +85,7 @@ class Simulation:
     seed: int = quantity(0, "1", 0, 2**32 - 1, "random seed; equal seeds give equal logs")
     end_with_task: bool = plain(False, "end within 20 ms after the log contains the task's outcome")
     on_fault: str = choice(
-        "continue", ("continue", "stop"), "after a fault: go on in a safe state, or end in an error"
+        "continue", ("continue", "stop"), "after a fault: hold a safe state, or stop with an error"
     )
 
 
@@ -122,7 +123,7 @@ class Scenario:
 
     @property
     def first_sheet_spring(self) -> SheetSpring | None:
-        """The scenario's sheet spring, from `sheet_spring` or `environment`, or None."""
+        """Elastic sheet to touch, from `sheet_spring` or `environment`, or None."""
         return next((thing for thing in self._environments if isinstance(thing, SheetSpring)), None)
 
     @property
@@ -212,7 +213,7 @@ def find_shipped_file(kind: str, name_or_path: str | Path, folder: Path, where: 
 def settings_without_range_check(
     schema: type[_T], data: Any, where: str, defaults: _T | None = None
 ) -> _T:
-    """Return a `schema` object from YAML data, without range checks; `where` begins messages."""
+    """Return an object of class `schema` from YAML data, without range checks of its fields."""
     config.check_structure(schema, data, where)
     data = dict(data)
     things = [dict(thing) for thing in data.pop("environment", [])] if schema is Scenario else []
@@ -248,7 +249,7 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
 
 
 def referenced_files(scenario: Scenario) -> list[Path]:
-    """Return the files with absolute paths in the scenario, and the files that these include."""
+    """Return the files at absolute paths in the scenario, and the files that they include."""
     leader = scenario.master.leader
     packages = map(Path, () if leader is None else leader.package_paths)
     folders = (*scenario.slave.package_folders, *packages)
@@ -303,9 +304,9 @@ def _check_operator_task(scenario: Scenario, where: str) -> None:
 def _check_integration_step(scenario: Scenario, where: str) -> None:
     simulation = scenario.simulation
     fixed = simulation.integrator != "runge_kutta3"
-    if scenario.surroundings is not None and fixed and simulation.max_step > _MAX_STEP_IN_CONTACT_S:
+    if scenario.surroundings is not None and fixed and simulation.max_step > _MAX_FIXED_STEP_S:
         what = f"fixed steps of {simulation.max_step:g} s are too long for contact"
-        remedy = f"set it to {_MAX_STEP_IN_CONTACT_S:g}, or integrator: runge_kutta3"
+        remedy = f"set it to {_MAX_FIXED_STEP_S:g}, or integrator: runge_kutta3"
         raise DrakeTeleopError(what, where=f"{where}:simulation.max_step", remedy=remedy)
 
 

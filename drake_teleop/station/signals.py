@@ -92,7 +92,7 @@ SIGNALS = _signals_by_name(6)
 
 
 def signal_with_size(name: str, size: int, sliding: Collection[int] = ()) -> Signal:
-    """Return the description of a recorded signal; `size` is its number of components.
+    """Return the description of a recorded signal with `size` components.
 
     `sliding` contains the indices of joints with positions in m and forces in N.
     """

@@ -37,7 +37,7 @@ def simulate(
 
     Args:
         diagram: station from `MakeTeleopStation`.
-        simulation: duration, settling time, integrator and seed; required.
+        simulation: duration, settling time, integrator and seed.
         progress: True shows a progress bar after one second; or a function of the completed
             fraction.
         log: folder for a log in parts, written during the run so that memory does not grow. After
@@ -74,7 +74,7 @@ def simulate(
         for time in np.append(1e-3 * milliseconds, end):
             advance_without_garbage_collection(simulator, time)
             if stops:
-                rows = _raise_fault_in_new_log_rows(simulator, simulation.settle, rows)
+                rows = _check_log_rows_for_faults(simulator, simulation.settle, rows)
             # The newest row counts: without the outcome in the log, the task would seem unfinished.
             over = task is not None and logged.data()[task][OUTCOME_INDEX, -1:].any()
             if on_disk is not None and on_disk.num_unwritten_rows() >= _LOG_ROWS_PER_PART:
@@ -91,7 +91,7 @@ def simulate(
     return read_recorded_signals(simulator, simulation.settle)
 
 
-def _raise_fault_in_new_log_rows(simulator: Simulator, start: float, num_checked_rows: int) -> int:
+def _check_log_rows_for_faults(simulator: Simulator, start: float, num_checked_rows: int) -> int:
     station = simulator.get_system()
     log = station.GetSubsystemByName(LOG_BLOCK_NAME).FindLog(simulator.get_context())
     for name, column in log_slices_of_signals(station).items():

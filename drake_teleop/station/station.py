@@ -37,18 +37,17 @@ def MakeTeleopStation(
 
     Args:
         load_estimate: (16,) Eq. (7), [offsets [N, N m]; phi] about So in S, from an identification.
-            Optional if the estimator runs online or sigma = gamma; without an estimate there is no
-            signal `contact_wrench_S`.
+            Optional if the estimator runs online or load and contact have equal scales; signal
+            `contact_wrench_S` requires it.
         load_covariance: (16, 16) covariance of the estimate, for a monitored load
             (`load_estimator.watch`). Use a method for noisy motion ("total"); the covariance of
             least squares is too small.
-        noise_floor: noise of the wrench minus the load's part in free motion, at the estimator's
-            rate, for contact detection: `LoadIdentification.noise_floor`.
+        noise_floor: `LoadIdentification.noise_floor` at the estimator's rate, to detect contact.
         master: custom system with the ports of `MakeMasterSide(scenario)`.
         channel: custom system with the ports of `MakeChannel(scenario)`; the scenario's channel and
             passivity are unused.
-        slave: custom system with the ports of `MakeSlaveSide(scenario, ...)`, such as one with
-            another controller; load_estimate, load_covariance and noise_floor are unused.
+        slave: custom system with the ports of `MakeSlaveSide(scenario, ...)`; load_estimate,
+            load_covariance and noise_floor are unused.
 
     Raises:
         DrakeTeleopError: for an invalid value, or a custom side without a required port.

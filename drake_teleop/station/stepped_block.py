@@ -22,7 +22,7 @@ class SteppedBlock(DoubleOnlySystem, LeafSystem):
     def _declare_step(self, results: list[Array], num_states: int, period: float) -> None:
         """Declare the discrete states and the `period` [s] of their step.
 
-        `results` are the initial arrays, of which the first `num_states` are the states.
+        `results` are initial arrays: first `num_states` states, then outputs.
         """
         # Integers are faster than Drake's own indices.
         self._states = [int(self.DeclareDiscreteState(part)) for part in results[:num_states]]
@@ -47,7 +47,7 @@ class SteppedBlock(DoubleOnlySystem, LeafSystem):
 
     @abstractmethod
     def _advance_states_and_outputs(self, context: Context, results: list[Array]) -> None:
-        """Advance the states `results[:num_states]` by a period; write the rest, the outputs."""
+        """Advance the states `results[:num_states]` by a period; write the other, output arrays."""
 
     def _calc_step_results(self, context: Context, step: AbstractValue) -> None:
         results = step.get_mutable_value()

@@ -53,7 +53,7 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
     noticed, touching = state[span, decision.CONTACT_PERCEIVED_INDEX] > 0.0, force[span] > 0.0
     # The log may start after the start of the task.
     taken = float(t[ended]) + scenario.simulation.settle - task.t_start
-    success = done and not _failed_criterion(result, scenario, task, ended)
+    success = done and not _unmet_criterion(result, scenario, task, ended)
     measures_of_success = {
         "task_time_s": taken,
         "contact_force_overshoot_N": max(float(force[span].max()) - wanted, 0.0),
@@ -66,7 +66,7 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
     figures = measures_of_success | {
         "success": float(success),
         "detection_time_s": detection_delay(t[span], touching, noticed),
-        "false_notices": float(_count_notices_before_contact(touching, noticed)),
+        "false_notices": float(_count_false_detections(touching, noticed)),
     }
     return {name: figures[name] for name in TASK_MEASURE_NAMES}
 
@@ -79,7 +79,7 @@ def task_failure(result: SimulationResult, scenario: Scenario) -> str:
     if outcome != 0.0 and ended == 0:
         return "the task ended before the log begins; set a shorter simulation.settle"
     if outcome > 0.0:
-        wrong = _failed_criterion(result, scenario, task, ended)
+        wrong = _unmet_criterion(result, scenario, task, ended)
         return f"the operator finished at {at:.2f} s, but {wrong}" if wrong else ""
     phase = int(state[ended if outcome == 0.0 else max(ended - 1, 0), decision.PHASE_INDEX])
     if phase == decision.PHASE_WAITING:
@@ -121,7 +121,7 @@ def true_contact_force_magnitudes(result: SimulationResult) -> Array:
 
 
 def detection_delay(t: Array, touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> float:
-    """Return the time from the first contact to the next detection [s]; nan without either."""
+    """Return the time from the first contact to the next detection [s]; nan if one is missing."""
     if not touching.any():
         return math.nan
     contact = int(np.argmax(touching))
@@ -129,7 +129,7 @@ def detection_delay(t: Array, touching: NDArray[np.bool_], noticed: NDArray[np.b
     return float(t[contact + int(np.argmax(after))] - t[contact]) if after.any() else math.nan
 
 
-def _count_notices_before_contact(touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> int:
+def _count_false_detections(touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> int:
     before = int(np.argmax(touching)) if touching.any() else len(touching)
     return int(np.count_nonzero(np.diff(noticed[:before].astype(int), prepend=0) == 1))
 
@@ -138,7 +138,7 @@ def _contact_forces_during_hold(t: Array, force: Array, task: Press, row: int) -
     return force[: row + 1][t[: row + 1] >= t[row] - task.hold]
 
 
-def _failed_criterion(result: SimulationResult, scenario: Scenario, task: Task, row: int) -> str:
+def _unmet_criterion(result: SimulationResult, scenario: Scenario, task: Task, row: int) -> str:
     force = true_contact_force_magnitudes(result)
     if isinstance(task, Press):
         held = float(_contact_forces_during_hold(result.t, force, task, row).mean())

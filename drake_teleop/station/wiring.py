@@ -20,7 +20,7 @@ SIGNALS_OF_COMBINED_PORT = {
 
 
 def export_outputs(builder: DiagramBuilder, block: System, *names: str, **renamed: str) -> None:
-    """Export output ports of a block by name; `new_name="port"` exports under another name."""
+    """Export output ports by name; keyword `new_name="port"` exports under another name."""
     for name, port in (dict(zip(names, names, strict=True)) | renamed).items():
         builder.ExportOutput(block.GetOutputPort(port), name)
 
@@ -60,7 +60,7 @@ def connect_matching_inputs(
 def build_with_log(
     builder: DiagramBuilder, title: str, sides: Iterable[System], log_hz: float
 ) -> Diagram:
-    """Export the sides' signals, record them at `log_hz`, and return the built diagram."""
+    """Return the diagram that exports the sides' signals and records them at `log_hz`."""
     outputs = {
         port.get_name(): port
         for side in sides

@@ -10,12 +10,12 @@ from pydrake.systems.primitives import PassThrough
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.channel import channel
-from drake_teleop.station.channel.channel import SLAVE_METHOD_MEMORY, Channel, step_channel
+from drake_teleop.station.channel.channel import SLAVE_METHOD_MEMORY_SLICE, Channel, step_channel
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
 from drake_teleop.station.channel_side import (
     MakeChannel,
-    _passivity_config_for_arm_and_device,
-    slave_wrench_power_scale,
+    _passivity_with_mass_and_encoder_step,
+    slave_to_master_power_unit_scale,
 )
 from drake_teleop.station.operator.operator import OperatorConfig, Sine
 from drake_teleop.station.passivity.ledger import LedgerConfig
@@ -45,7 +45,7 @@ def test_method_is_limited_to_the_force_and_torque_of_the_device(model, share):
     device = scenario.master.device(0.0, 0.0)
     force, torque = device.parameters.peak_force, min(device.parameters.peak_torque)
     own = PassivityConfig(method="wave", force_limit=share * force, torque_limit=share * torque)
-    limited = _passivity_config_for_arm_and_device(replace(scenario, passivity=own))
+    limited = _passivity_with_mass_and_encoder_step(replace(scenario, passivity=own))
     assert limited.method == "wave"
     assert limited.force_limit == pytest.approx(min(share, 1.0) * force)
     assert limited.torque_limit == pytest.approx(min(share, 1.0) * torque)
@@ -57,12 +57,12 @@ def test_ledger_has_the_encoder_steps_of_the_device():
     steps = {}
     for model in ("phantom_premium_15", "omega_6", "geomagic_touch"):
         scenario.master.model = model
-        steps[model] = _passivity_config_for_arm_and_device(scenario).ledger.encoder_step
+        steps[model] = _passivity_with_mass_and_encoder_step(scenario).ledger.encoder_step
     assert steps["phantom_premium_15"] == [0.0, 0.0]
     np.testing.assert_allclose(steps["omega_6"], [1e-5, np.radians(0.09)])
     assert steps["geomagic_touch"][0] == pytest.approx(5.5e-5, rel=0.02)
     scenario.passivity = PassivityConfig(ledger=LedgerConfig(encoder_step=[2e-4, 1e-3]))
-    assert _passivity_config_for_arm_and_device(scenario).ledger.encoder_step == [2e-4, 1e-3]
+    assert _passivity_with_mass_and_encoder_step(scenario).ledger.encoder_step == [2e-4, 1e-3]
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_slave_power_is_scaled_by_the_rendered_share_over_the_motion(gamma, forc
             force_scaling=ForceScalingConfig(gamma=gamma, force_scale=force_scale),
             kinematic_scaling=KinematicScalingConfig(*scales),
         )
-        found = slave_wrench_power_scale(scenario)
+        found = slave_to_master_power_unit_scale(scenario)
         np.testing.assert_allclose(found, rendered / np.array(expected))
 
 
@@ -170,9 +170,9 @@ def test_load_wrench_is_transformed_as_the_wrench():
     for name, value in inputs.items():
         block.GetInputPort(name).FixValue(context, value)
     ends = block.EvalUniquePeriodicDiscreteUpdate(context).value(2)
-    held = ends[SLAVE_METHOD_MEMORY][LAST_PORT_WRENCH]
+    held = ends[SLAVE_METHOD_MEMORY_SLICE][LAST_PORT_WRENCH]
     assert np.linalg.norm(held[:3]) == pytest.approx(np.linalg.norm(wrench[:3]) / 0.5)
-    np.testing.assert_allclose(ends[SLAVE_METHOD_MEMORY][LOAD_WRENCH], 0.5 * held, atol=1e-15)
+    np.testing.assert_allclose(ends[SLAVE_METHOD_MEMORY_SLICE][LOAD_WRENCH], 0.5 * held, atol=1e-15)
 
 
 def test_packets_in_transit_belong_to_the_context():

@@ -9,8 +9,8 @@ import pytest
 
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.channel import (
-    SLAVE_METHOD_MEMORY,
-    initial_state_of_ends,
+    SLAVE_METHOD_MEMORY_SLICE,
+    initial_state_of_master_and_slave_ends,
     step_channel,
 )
 from drake_teleop.station.channel.network import NetworkConfig
@@ -61,7 +61,11 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
     frame = np.array([1.0, 0, 0, 0, 1, 0, 0, 0, 1, 1, 1])
     hand = hand_position()
     start = np.array([1.0, 0, 0, 0, hand[0], 0, 0])
-    ends, received, slave = initial_state_of_ends(method, p, start), start.copy(), start.copy()
+    ends, received, slave = (
+        initial_state_of_master_and_slave_ends(method, p, start),
+        start.copy(),
+        start.copy(),
+    )
     ports, felt, velocity = np.zeros(8), np.zeros(7), 0.0
     found = Run(
         np.arange(STEPS) * T, hand, *(np.zeros((STEPS, n)) for n in (7, 7, 8, 2)), np.zeros(STEPS)
@@ -89,7 +93,7 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
         found.touched[k] = wall < 0.0
         found.command[k], found.felt[k], found.ports[k] = received, felt, ports
         pull = p[SERVO_K][0] * (received[4] - slave[4]) - p[SERVO_D][0] * velocity
-        found.servo[k] = pull, ends[SLAVE_METHOD_MEMORY][LAST_PORT_WRENCH][0]
+        found.servo[k] = pull, ends[SLAVE_METHOD_MEMORY_SLICE][LAST_PORT_WRENCH][0]
     return found
 
 

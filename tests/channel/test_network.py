@@ -294,10 +294,12 @@ def test_no_two_packets_share_a_random_number(monkeypatch, distribution):
         taken.append((k, draw))
         return 0.6  # no packet is lost, and each is duplicated
 
-    monkeypatch.setattr(network, "_draw_uniform", uniform)
-    monkeypatch.setattr(network, "_draw_delay_steps", network._draw_delay_steps.py_func)
+    monkeypatch.setattr(network, "_random_uniform", uniform)
+    monkeypatch.setattr(
+        network, "_random_packet_delay_steps", network._random_packet_delay_steps.py_func
+    )
     for k in range(100, 120):
-        network._draw_loss_and_delays.py_func(p, k, 0.0)
+        network._random_loss_and_delays.py_func(p, k, 0.0)
     packets, draws = np.array(taken).T
     assert set(packets) == set(range(100, 120)) and set(draws) <= set(range(16))
     each = {"uniform": 1, "normal": 2, "gamma": 3}[distribution]

@@ -13,7 +13,7 @@ from drake_teleop.station.operator.perception import (
     _FORCE_NOISE_DENSITY_N_PER_SQRT_HZ,
     CONTACT_NOTICED_INDEX,
     DETECTION_THRESHOLD_INDEX,
-    EXCESS_FORCE_START,
+    EXCESS_FORCE_START_INDEX,
     Perception,
     _update_force_model_by_kalman_filter,
     perceive_contact,
@@ -83,7 +83,7 @@ def test_inertial_force_masks_a_contact(push):
 def test_moved_mass_is_learned_and_is_no_contact():
     felt = perceive_contact(T, *record(1.2, 2.0, 0.0, 0.1), HUMAN, 0.0, attentive=3.0)
     late = T > 3.0
-    assert np.abs(felt[late, EXCESS_FORCE_START:DETECTION_THRESHOLD_INDEX]).max() < 0.1
+    assert np.abs(felt[late, EXCESS_FORCE_START_INDEX:DETECTION_THRESHOLD_INDEX]).max() < 0.1
     assert felt[late, DETECTION_THRESHOLD_INDEX].min() > 0.4
     assert not felt[:, CONTACT_NOTICED_INDEX].any()
 

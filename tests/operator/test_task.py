@@ -146,7 +146,7 @@ def test_submovement_respects_acceleration_and_minimum_duration(monkeypatch, len
     movement = Movement(acceleration=2.0, shortest=0.2, noise=0.0)
     person, plans = decision.pack_operator_parameters(training, Perception(), movement), []
     monkeypatch.setattr(decision, "_tool_to_hand_motion", decision._tool_to_hand_motion.py_func)
-    monkeypatch.setattr(decision, "_draw_normal_number", lambda *_: 0.0)
+    monkeypatch.setattr(decision, "_normal_random_number", lambda *_: 0.0)
     monkeypatch.setattr(decision, "plan_move", lambda *plan: plans.append(plan))
     took = decision._plan_submovement.py_func(
         person, None, 0, 1.0, np.array([0.0, 1.5 * length, 0.0])
@@ -399,7 +399,7 @@ def test_each_delay_of_the_operator_has_its_own_use(forward, backward, vision, r
     training = decision.OperatorTraining(np.eye(3), 1.0, 0.5, forward, backward, 0)
     senses = Perception(vision_delay=vision, reaction_time=reaction)
     person = decision.pack_operator_parameters(training, senses, Movement())
-    round_trip = forward + backward + decision._STATION_RESPONSE_TIME_S
+    round_trip = forward + backward + decision._STATION_REACTION_TIME_S
     assert person.vision_delay == pytest.approx(vision + round_trip)
     assert person.force_delay == pytest.approx(reaction + round_trip)
     config = replace(Scenario(), operator__task=Reach(), operator__perception=senses).operator

@@ -48,7 +48,7 @@ from drake_teleop.station.passivity.methods import (
     step_addresses,
 )
 from drake_teleop.station.passivity.packet import (
-    MAX_HAND_WRENCH_RATE,
+    MAX_HAND_WRENCH_RATES,
     PACKET_LOAD_WRENCH,
     PACKET_NUMBER,
     PACKET_SIZE,
@@ -413,8 +413,8 @@ def test_wrench_cross_fades_after_missing_packets():
     hand.packet[WRENCH][2] = 3.0
     hand.packet[PACKET_NUMBER] += 3.0
     course = [hand.step()[2] for _ in range(10)]
-    assert course[0] == pytest.approx(1.0 + MAX_HAND_WRENCH_RATE[0] * T)
-    assert np.diff(course).max() <= MAX_HAND_WRENCH_RATE[0] * T + 1e-12 and course[
+    assert course[0] == pytest.approx(1.0 + MAX_HAND_WRENCH_RATES[0] * T)
+    assert np.diff(course).max() <= MAX_HAND_WRENCH_RATES[0] * T + 1e-12 and course[
         -1
     ] == pytest.approx(3.0)
 

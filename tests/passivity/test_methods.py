@@ -21,7 +21,7 @@ from drake_teleop.lab.comparison.one_dof import (
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.passivity import four_channel, ledger_slave, pspm, tdpa, two_layer, wave
-from drake_teleop.station.passivity.force_limit import _HAND_WRENCH_LIMIT, ForceLimitConfig
+from drake_teleop.station.passivity.force_limit import _WRENCH_LIMIT_SLICE, ForceLimitConfig
 from drake_teleop.station.passivity.memory import (
     DISSIPATED_ENERGY,
     LAST_PORT_WRENCH,
@@ -274,7 +274,7 @@ def test_limits_and_servo_have_their_own_scales(power, motion, limits):
     )
     p = method_parameters(config, power, motion)
     np.testing.assert_allclose(p[WRENCH_LIMIT] * motion, limits)
-    np.testing.assert_allclose(p[_HAND_WRENCH_LIMIT] * motion, np.multiply(limits, [0.5, 2.0]))
+    np.testing.assert_allclose(p[_WRENCH_LIMIT_SLICE] * motion, np.multiply(limits, [0.5, 2.0]))
     for part, values in ((SERVO_K, (11, 12)), (SERVO_D, (13, 14)), (SLAVE_MASS, (15, 16))):
         np.testing.assert_allclose(p[part] / power, values)
     np.testing.assert_array_equal(p[SLAVE_PER_MASTER_MOTION], motion)

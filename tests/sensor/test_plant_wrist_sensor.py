@@ -480,8 +480,8 @@ REFUSED = {
     ),
     "bandwidth": (
         lambda c: c.options.update(config=WristSensorConfig()),
-        "AddWristSensor.bandwidth_hz: a bandwidth of 500 Hz is too near to half of the sensor's "
-        "rate (1000 Hz)",
+        "AddWristSensor.bandwidth_hz: bandwidth 500 Hz is too near half the sensor's rate "
+        "(1000 Hz)",
     ),
 }
 

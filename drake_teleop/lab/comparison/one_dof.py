@@ -18,10 +18,10 @@ from drake_teleop.common.vectors import copy_into
 from drake_teleop.lab.analysis.one_axis import AxisParameters
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.channel import (
-    MASTER_METHOD_MEMORY,
-    PORTS_SIGNAL_SIZE,
-    SLAVE_METHOD_MEMORY,
-    initial_state_of_ends,
+    MASTER_METHOD_MEMORY_SLICE,
+    NUM_PORTS_VALUES,
+    SLAVE_METHOD_MEMORY_SLICE,
+    initial_state_of_master_and_slave_ends,
     step_channel,
 )
 from drake_teleop.station.channel.network import NetworkConfig
@@ -195,8 +195,8 @@ def run_one_dof(
         )
     ]
     states = [network.initial_network_state(line, np.zeros(PACKET_SIZE)) for line in lines]
-    ends = initial_state_of_ends(passivity.method, p, start)
-    memories = ends[MASTER_METHOD_MEMORY], ends[SLAVE_METHOD_MEMORY]
+    ends = initial_state_of_master_and_slave_ends(passivity.method, p, start)
+    memories = ends[MASTER_METHOD_MEMORY_SLICE], ends[SLAVE_METHOD_MEMORY_SLICE]
     stored = float(memories[0][STORED_ENERGY][0] + memories[1][STORED_ENERGY][0])
     numbers = (
         model.device_mass, model.device_friction, model.slave_mass, model.servo_stiffness,
@@ -346,7 +346,7 @@ def _simulate_one_dof_run(
     frame[0] = frame[4] = frame[8] = frame[9] = frame[10] = 1.0
     pose_m, pose_s, received = start.copy(), start.copy(), start.copy()
     wrench, load, hand = np.zeros(6), np.zeros(6), np.zeros(6)
-    displayed, ports = np.zeros(7), np.zeros(PORTS_SIGNAL_SIZE)
+    displayed, ports = np.zeros(7), np.zeros(NUM_PORTS_VALUES)
     # Columns: master, slave, command, displayed, wall, energy (2), silent (2), energies (4).
     rows, energies = np.empty((inputs.shape[0], 13)), np.zeros(4)
     x = x_s = x_before = start[4]

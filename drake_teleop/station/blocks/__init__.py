@@ -1,4 +1,4 @@
-"""Drake blocks of the paper's Fig. 4, with one port per signal, for custom Diagrams."""
+"""Drake blocks of the teleoperation station, with one port per signal, for custom Diagrams."""
 
 from drake_teleop.station.blocks.channel import NetworkChannel, PassivityAtMaster, PassivityAtSlave
 from drake_teleop.station.blocks.estimators import ContactDetector, LoadEstimator

@@ -1,4 +1,4 @@
-"""Blocks of the channel: a network, and a passivity method's two ends for any network."""
+"""Blocks of the channel: a network, and the passivity method at its master's and slave's end."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array
 from drake_teleop.station.channel import channel as steps
 from drake_teleop.station.channel import network
-from drake_teleop.station.channel.channel import MIN_TIMEOUT_S, PORTS_SIGNAL_SIZE
+from drake_teleop.station.channel.channel import MIN_TIMEOUT_S, NUM_PORTS_VALUES
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity import methods
 from drake_teleop.station.passivity.methods import PassivityConfig
@@ -30,7 +30,7 @@ class NetworkChannel(SteppedBlock):
         - packet: (N,) numbers to send
         output_ports:
         - received: (N + 1,) newest packet that has arrived, zeros before the first; 1 if it is new
-        - arriving: (N + 1,) value of `received` in the next period; direct feedthrough
+        - arriving: (N + 1,) as `received`, one period earlier; direct feedthrough
 
     Connect `arriving` to a block with the same period and without direct feedthrough.
 
@@ -100,9 +100,9 @@ class _PassivityEndBlock(SteppedBlock):
         parameters, mapping = steps.pack_parameters_and_mapping(passivity, R, scales, force_scale)
         self._method = methods.step_addresses(passivity.method)
         self._constants = period, timeout, mapping, parameters
-        ends = steps.initial_state_of_ends(passivity.method, parameters, start)
+        ends = steps.initial_state_of_master_and_slave_ends(passivity.method, parameters, start)
         # Ends, command, port energies, rendered wrench and contact flag, packet.
-        results = [ends, start, np.zeros(PORTS_SIGNAL_SIZE), np.zeros(7), np.zeros(PACKET_SIZE)]
+        results = [ends, start, np.zeros(NUM_PORTS_VALUES), np.zeros(7), np.zeros(PACKET_SIZE)]
         self._received = self.DeclareVectorInputPort("received", PACKET_SIZE + 1)
         self._ports = [
             (self.DeclareVectorInputPort(name, size), name in _OPTIONAL_INPUT_PORT_NAMES)
@@ -110,9 +110,9 @@ class _PassivityEndBlock(SteppedBlock):
         ]
         self._declare_step(results, 3, period)
         self._declare_output("packet", 4, slice(0, PACKET_SIZE))
-        self._declare_master_or_slave_output()
+        self._declare_output_of_own_end()
 
-    def _evaluate_inputs_and_last_packet(self, context: Context) -> tuple[list[Array], Array, bool]:
+    def _evaluate_inputs_packet_fresh(self, context: Context) -> tuple[list[Array], Array, bool]:
         packet = self._received.Eval(context)
         inputs = []
         for port, is_optional in self._ports:
@@ -133,7 +133,7 @@ class PassivityAtMaster(_PassivityEndBlock):
         - hand_wrench_E: (6,) wrench of the hand on the stylus at E, in B; 0 if unconnected
         output_ports:
         - packet: (38,) for the slave
-        - wrench_to_master: (6,) F_E_B to render at the hand [N, N m]
+        - wrench_to_master: (6,) F_E_B, [f; tau] to render on the stylus at E, in B [N, N m]
 
     Args:
         passivity: method and parameters, equal at both ends.
@@ -148,12 +148,12 @@ class PassivityAtMaster(_PassivityEndBlock):
     __slots__ = ()
     _INPUT_PORT_NAMES_AND_SIZES = (("pose_command", 7), ("hand_wrench_E", 6))
 
-    def _declare_master_or_slave_output(self) -> None:
+    def _declare_output_of_own_end(self) -> None:
         self._declare_output("wrench_to_master", 3, slice(0, 6))
 
     def _advance_states_and_outputs(self, context: Context, results: list[Array]) -> None:
         ends, _, port_energies, wrench, packet = results
-        inputs, *received = self._evaluate_inputs_and_last_packet(context)
+        inputs, *received = self._evaluate_inputs_packet_fresh(context)
         states = *self._constants, ends, port_energies[:2], packet, wrench
         steps.step_master_end(self._method, *inputs, *received, *states)
 
@@ -166,7 +166,7 @@ class PassivityAtSlave(_PassivityEndBlock):
         name: PassivityAtSlave
         input_ports:
         - received: (39,) newest packet from the master; 1 if it is new
-        - wrench_B: (6,) F_E_B to render, from force scaling [N, N m]
+        - wrench_B: (6,) F_E_B to render at the hand, output of `ForceScaling` [N, N m]
         - load_wrench_B: (6,) part of wrench_B from the load, for method `ledger`; 0 if unconnected
         - pose_slave: (7,) actual X_WS of the slave
         - saturated: (1,) 1 to send the last valid wrench instead; 0 if unconnected
@@ -184,12 +184,12 @@ class PassivityAtSlave(_PassivityEndBlock):
         *(("saturated", 1), ("contact", 1)),
     )
 
-    def _declare_master_or_slave_output(self) -> None:
+    def _declare_output_of_own_end(self) -> None:
         self.DeclareStateOutputPort("pose_to_slave", DiscreteStateIndex(self._states[1]))
 
     def _advance_states_and_outputs(self, context: Context, results: list[Array]) -> None:
         ends, pose, port_energies, _, packet = results
-        (*values, saturated, contact), *received = self._evaluate_inputs_and_last_packet(context)
+        (*values, saturated, contact), *received = self._evaluate_inputs_packet_fresh(context)
         flags = bool(saturated[0] > 0.5), float(contact[0])
         states = *self._constants, ends, pose, port_energies, packet
         steps.step_slave_end(self._method, *values, *flags, *received, *states)

@@ -15,13 +15,12 @@ from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.station.estimation import contact_detection, load_estimator
 
 
-class _SampleInputPorts:
+class _SeparateSignalsAsSample:
     def __init__(self, system: LeafSystem) -> None:
         sizes = list(regressor.signal_sizes_of_sample(0).items())[:-1]
         self._ports = [system.DeclareVectorInputPort(*each) for each in sizes]
 
     def Eval(self, context: Context) -> Array:
-        """Return the sample composed of the values of all input ports."""
         sample, first = np.zeros(regressor.FIRST_JOINT_INDEX), 0
         for port in self._ports:
             # Unconnected: `saturated` is 0.
@@ -74,7 +73,7 @@ class LoadEstimator(DoubleOnlySystem, load_estimator.LoadEstimator):
         super().__init__(config, noise, motion, period, regressor.FIRST_JOINT_INDEX, start)
 
     def _declare_sample_input_ports(self, size: int) -> Any:
-        return _SampleInputPorts(self)
+        return _SeparateSignalsAsSample(self)
 
 
 class ContactDetector(DoubleOnlySystem, contact_detection.ContactDetection):
@@ -116,7 +115,7 @@ class ContactDetector(DoubleOnlySystem, contact_detection.ContactDetection):
         self._orientation = self.DeclareVectorInputPort("R_WS", 9)
 
     def _declare_sample_input_ports(self, arm: Any) -> Any:
-        return _SampleInputPorts(self)
+        return _SeparateSignalsAsSample(self)
 
     def _update_and_get_contact_flag(
         self, context: Context, memory: Array, sample: Array, estimate: Array

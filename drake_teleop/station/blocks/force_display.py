@@ -1,4 +1,4 @@
-"""Block that converts a wrench F to motor torques J^T F within the device's limits."""
+"""Block of the force display at the haptic device."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ForceDisplay(SteppedBlock):
         - fault_at_hand: (1,) `Fault` code, 0 without fault
 
     Args:
-        device: such as `Master().device(0.0, 0.0)`.
+        device: haptic device, such as `Master().device(hand_mass=0.0, hand_inertia=0.0)`.
         period: sampling period [s].
         start: (6,) joint positions to use until valid ones arrive [rad].
     """

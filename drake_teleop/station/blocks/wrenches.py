@@ -24,7 +24,7 @@ _GRAVITY_W_M_S2 = (0.0, 0.0, -9.81)
 _MOTION_PORT_NAMES = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
 
 
-def _function_for_scalar(function: Any, T: Any) -> Callable[..., None]:
+def _compiled_or_python(function: Any, T: Any) -> Callable[..., None]:
     return function if T is float else function.py_func
 
 
@@ -35,7 +35,7 @@ def _zero_vector_of_type(T: Any, size: int) -> Any:
 @TemplateSystem.define("NonContactWrench_")
 def NonContactWrench_(T: Any) -> Any:
     class NonContactWrenchT(LeafSystem_[T]):
-        """Block that outputs the wrench V phi of a load's weight and inertia, Eq. (12).
+        """Block that outputs the wrench of a load's weight and inertia, Eq. (12).
 
         .. pydrake_system::
 
@@ -49,7 +49,7 @@ def NonContactWrench_(T: Any) -> Any:
             - non_contact_wrench_S: (6,) wrench on the load [N, N m]
 
         Args:
-            phi: (10,) inertial parameters of the load about So, in S; a numeric parameter.
+            phi: (10,) inertial parameters of the load about So, in S.
         """
 
         __slots__ = NO_EXTRA_SLOTS
@@ -74,7 +74,7 @@ def NonContactWrench_(T: Any) -> Any:
                 phi = context.get_numeric_parameter(self._parameter).CopyToVector()
             wrench = _zero_vector_of_type(T, 6)
             motion = [port.Eval(context) for port in self._motion]
-            _function_for_scalar(non_contact_wrench_into, T)(*motion, phi, wrench)
+            _compiled_or_python(non_contact_wrench_into, T)(*motion, phi, wrench)
             output.SetFromVector(wrench)
 
     return NonContactWrenchT
@@ -86,7 +86,7 @@ NonContactWrench = NonContactWrench_[float]
 @TemplateSystem.define("WrenchScaling_")
 def WrenchScaling_(T: Any) -> Any:
     class WrenchScalingT(LeafSystem_[T]):
-        """Block that outputs contact wrench F_c (Eq. 13) and scaled wrench F' (Eq. T7).
+        """Block that outputs contact wrench F_c and the sum F' of scaled contact and load wrench.
 
         .. pydrake_system::
 
@@ -142,7 +142,7 @@ def WrenchScaling_(T: Any) -> Any:
             given, wrench = self._config.gripper_phi, _zero_vector_of_type(T, 6)
             gripper = estimate[6:] if given is None else np.asarray(given)
             parts = gripper, estimate[6:] - gripper
-            _function_for_scalar(scaled_wrench_into, T)(
+            _compiled_or_python(scaled_wrench_into, T)(
                 measured, estimate[:6], s, omega, alpha, *parts, *scales[:3], wrench
             )
             excess = [w - i for w, i in zip(scales[3:], scales[:2], strict=True)]
@@ -151,7 +151,7 @@ def WrenchScaling_(T: Any) -> Any:
                     where = "WrenchScaling: gravity in S"
                     raise compensation.unknown_gravity_error(where, "connect R_WS")
                 gravity = self._evaluate_R_WS(context).T @ self._gravity_W
-                _function_for_scalar(add_excess_weight_into, T)(gravity, *parts, *excess, wrench)
+                _compiled_or_python(add_excess_weight_into, T)(gravity, *parts, *excess, wrench)
             return wrench
 
         def _evaluate_R_WS(self, context: Any) -> Any:
@@ -170,7 +170,7 @@ def WrenchScaling_(T: Any) -> Any:
                 raise DrakeTeleopError(what, where="WrenchScaling.wrench_to_master", remedy=remedy)
             wrench, k = _zero_vector_of_type(T, 6), self._config.force_scale
             scaled, R_WS = self._scale_wrench(context, self._scales), self._evaluate_R_WS(context)
-            to_master_into = _function_for_scalar(force_scaling.wrench_to_master_into, T)
+            to_master_into = _compiled_or_python(force_scaling.wrench_to_master_into, T)
             to_master_into(scaled, R_WS, self._R_WB, k, k, wrench)
             output.SetFromVector(wrench)
 

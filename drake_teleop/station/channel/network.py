@@ -28,7 +28,7 @@ MAX_POSE_EXTRAPOLATION_S = 0.1  # [s]; after it the pose is constant
 
 # Distribution -> largest deviation from the mean, in units of jitter times delay. It cuts the delay
 # of one packet in 1e7.
-_MAX_DEVIATION_OVER_JITTER = {"uniform": 1.0, "normal": 3.0, "gamma": 6.0}
+_MAX_DEVIATION_PER_JITTER = {"uniform": 1.0, "normal": 3.0, "gamma": 6.0}
 _SILENCE_POLICY_NAMES = ("hold", "zero", "extrapolate")
 _SILENCE_POLICY_ZERO, _SILENCE_POLICY_EXTRAPOLATE = 1, 2
 _TRACE_STEP_S = 1e-3  # [s], for mean and maximum of a trace
@@ -41,15 +41,15 @@ class NetworkConfig:
     """Settings of one direction of a network; the default is ideal: packet k arrives at step k."""
 
     delay: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "mean one-way delay")
-    jitter: float = quantity(0.0, "1", 0.0, 1.0, "sqrt(3) * standard deviation / mean of delay")
-    distribution: str = choice("uniform", tuple(_MAX_DEVIATION_OVER_JITTER), "delay distribution")
+    jitter: float = quantity(0.0, "1", 0.0, 1.0, "sqrt(3) * standard deviation / mean of the delay")
+    distribution: str = choice("uniform", tuple(_MAX_DEVIATION_PER_JITTER), "delay distribution")
     loss: float = quantity(0.0, "1", 0.0, 1.0, "mean share of lost packets")
-    burst: float = quantity(0.0, "s", 0.0, 100.0, "mean length of a bad state; 0: independent loss")
-    burst_loss: float = quantity(1.0, "1", 0.01, 1.0, "share of lost packets in a bad state")
+    burst: float = quantity(0.0, "s", 0.0, 100.0, "mean duration of a loss burst; 0: no bursts")
+    burst_loss: float = quantity(1.0, "1", 0.01, 1.0, "share of packets that a loss burst loses")
     duplicate: float = quantity(0.0, "1", 0.0, 1.0, "share of duplicated packets")
     rate_hz: float | None = quantity(None, "Hz", 1.0, 1e5, "largest packet rate; null: every step")
-    playout: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "packets are used at this age or later")
-    redundant: bool = plain(False, "packets repeat the data of the last `playout` seconds")
+    playout: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "jitter buffer: age of packets at use")
+    redundant: bool = plain(False, "each packet repeats the data of the last `playout` seconds")
     trace: str | None = plain(
         None,
         "CSV file of a recorded delay, relative to the scenario's folder, instead of delay, jitter "
@@ -60,8 +60,8 @@ class NetworkConfig:
     silence: str = choice(
         "hold",
         _SILENCE_POLICY_NAMES,
-        "values at steps without a new packet; hold: the newest packet; zero: the same with zero "
-        "velocity and wrench; extrapolate: the same with a pose that keeps its velocity for 0.1 s. "
+        "values at steps without a new packet; hold: the newest packet; zero: its pose with zero "
+        "velocity and wrench; extrapolate: its pose moved on at its velocity, for up to 0.1 s. "
         "Energies and integrals are always held",
     )
 
@@ -115,14 +115,13 @@ def network_parameters(
         direction: FORWARD or BACKWARD, with independent random numbers.
         period: time between steps [s].
         min_steps: smallest delay of a packet [steps].
-        delays: (M,) delay of each packet [steps], -1 if lost, instead of the config's trace;
-            repeated after its end.
+        delays: (M,) recorded delays [steps], -1 if lost, instead of `config.trace`; repeated.
     """
     config.check()
     trace = np.zeros(0) if config.trace is None else _read_delay_trace(Path(config.trace), period)
     trace = trace if delays is None else np.asarray(delays, np.float64)
     mean, playout = config.delay / period, math.floor(config.playout / period + 0.5)
-    max_deviation = _MAX_DEVIATION_OVER_JITTER[config.distribution] * config.jitter
+    max_deviation = _MAX_DEVIATION_PER_JITTER[config.distribution] * config.jitter
     longest = math.floor(mean * (1 + max_deviation) + 0.5)
     if trace.size:
         longest = max(int(trace.max()), 0)
@@ -134,7 +133,7 @@ def network_parameters(
     p[_RANDOM_KEY] = random_bits(np.uint64(random_bits(np.uint64(seed % 2**64), 0)), direction)
     p[_STEP_PERIOD], p[_DELAY_JITTER] = period, config.jitter
     p[_MEAN_DELAY_STEPS], p[_MAX_DELAY_STEPS] = mean, longest
-    p[_DELAY_DISTRIBUTION] = list(_MAX_DEVIATION_OVER_JITTER).index(config.distribution)
+    p[_DELAY_DISTRIBUTION] = list(_MAX_DEVIATION_PER_JITTER).index(config.distribution)
     p[_BAD_STATE_SHARE] = bad
     p[_BAD_STATE_PERSISTENCE] = math.exp(-period / time_constant) if time_constant > 0 else 0.0
     p[_BAD_STATE_LOSS_SHARE], p[_DUPLICATE_SHARE] = config.burst_loss, config.duplicate
@@ -157,7 +156,7 @@ def mean_delay(config: NetworkConfig) -> float:
 
 def longest_delay(config: NetworkConfig) -> float:
     """Return the largest one-way delay of an arriving packet [s], but at least the playout time."""
-    longest = config.delay * (1 + _MAX_DEVIATION_OVER_JITTER[config.distribution] * config.jitter)
+    longest = config.delay * (1 + _MAX_DEVIATION_PER_JITTER[config.distribution] * config.jitter)
     if config.trace is not None:
         longest = float(_read_delay_trace(Path(config.trace), _TRACE_STEP_S).max()) * _TRACE_STEP_S
     return max(longest, config.playout)
@@ -192,54 +191,53 @@ def _read_delay_trace(path: Path, period: float) -> Array:
 
 
 @njit(cache=True)
-def _draw_uniform(p, k, draw):
-    return (float(random_bits(np.uint64(p[_RANDOM_KEY]), 16 * k + draw)) + 1.0) * 2.0**-53
+def _random_uniform(p, packet, draw):
+    return (float(random_bits(np.uint64(p[_RANDOM_KEY]), 16 * packet + draw)) + 1.0) * 2.0**-53
 
 
 @njit(cache=True)
-def _draw_delay_steps(p, k, draw):
-    """Return the delay of packet k [steps] (-1: lost), by random numbers `draw` to `draw` + 2."""
+def _random_packet_delay_steps(p, k, draw):
+    """Return the delay of packet k [steps] (-1: lost), from its random numbers from `draw` on."""
     if p.shape[0] > _DELAY_TRACE_START:
         steps = p[_DELAY_TRACE_START + k % (p.shape[0] - _DELAY_TRACE_START)]
         return int(max(steps, p[_MIN_DELAY_STEPS])) if steps >= 0.0 else -1
     mean, spread = p[_MEAN_DELAY_STEPS], p[_MEAN_DELAY_STEPS] * p[_DELAY_JITTER]
     if spread == 0.0:
         return int(p[_MAX_DELAY_STEPS])
-    u = _draw_uniform(p, k, draw)
+    u = _random_uniform(p, k, draw)
     if p[_DELAY_DISTRIBUTION] == 0:
         delay = mean + spread * (2.0 * u - 1.0)
     elif p[_DELAY_DISTRIBUTION] == 1:  # Box and Muller
-        angle = 2.0 * math.pi * _draw_uniform(p, k, draw + 1)
+        angle = 2.0 * math.pi * _random_uniform(p, k, draw + 1)
         delay = mean + spread / math.sqrt(3.0) * math.sqrt(-2.0 * math.log(u)) * math.cos(angle)
     else:  # sum of three exponential waits
-        u *= _draw_uniform(p, k, draw + 1) * _draw_uniform(p, k, draw + 2)
+        u *= _random_uniform(p, k, draw + 1) * _random_uniform(p, k, draw + 2)
         delay = mean - spread - spread / 3.0 * math.log(u)
     return int(min(max(delay + 0.5, p[_MIN_DELAY_STEPS]), p[_MAX_DELAY_STEPS]))
 
 
 @njit(cache=True)
-def _draw_loss_and_delays(p, k, bad):
-    """Return loss state after `bad` (1: bad), delays of packet and duplicate [steps] (-1: none)."""
+def _random_loss_and_delays(p, k, bad):
+    """Return if a loss burst continues, delays of packet k and its duplicate [steps], -1: none."""
     if p[_BAD_STATE_SHARE] > 0.0:
         likely = p[_BAD_STATE_SHARE] + (bad - p[_BAD_STATE_SHARE]) * p[_BAD_STATE_PERSISTENCE]
-        bad = 1.0 if _draw_uniform(p, k, 0) <= likely else 0.0
+        bad = 1.0 if _random_uniform(p, k, 0) <= likely else 0.0
     rate = p[_PACKETS_PER_STEP]
     if rate < 1.0 and math.floor(k * rate + 1e-9) == math.floor((k - 1) * rate + 1e-9):
         return bad, -1, -1
-    if bad == 1.0 and _draw_uniform(p, k, 1) <= p[_BAD_STATE_LOSS_SHARE]:
+    if bad == 1.0 and _random_uniform(p, k, 1) <= p[_BAD_STATE_LOSS_SHARE]:
         return bad, -1, -1
-    first = _draw_delay_steps(p, k, 2)
+    first = _random_packet_delay_steps(p, k, 2)
     second = -1
-    if first >= 0 and p[_DUPLICATE_SHARE] > 0.0 and _draw_uniform(p, k, 5) <= p[_DUPLICATE_SHARE]:
-        second = _draw_delay_steps(p, k, 6)
+    if first >= 0 and p[_DUPLICATE_SHARE] > 0.0 and _random_uniform(p, k, 5) <= p[_DUPLICATE_SHARE]:
+        second = _random_packet_delay_steps(p, k, 6)
     return bad, first, second
 
 
 def initial_network_state(p: Array, initial_packet: Array) -> tuple[Array, Array]:
     """Return the initial state of one direction: receiver (4 + N,), and packets in transit.
 
-    `p` is the result of `network_parameters`, `initial_packet` (N,) what the receiver reads before
-    the first packet.
+    The receiver reads `initial_packet` (N,) until the first packet arrives.
     """
     slots = int(p[_NUM_TRANSIT_SLOTS])
     receiver = np.concatenate([[p[_BAD_STATE_SHARE], -1.0, -1.0, 0.0], initial_packet])
@@ -251,7 +249,7 @@ def send_packet(p, state, k, packet):
     """Send `packet` at step `k` and update `state`; call this for every step from 0 on."""
     receiver, in_transit = state
     slots, size = int(p[_NUM_TRANSIT_SLOTS]), receiver.shape[0] - _LAST_PACKET
-    receiver[_IS_BAD_STATE], first, second = _draw_loss_and_delays(p, k, receiver[_IS_BAD_STATE])
+    receiver[_IS_BAD_STATE], first, second = _random_loss_and_delays(p, k, receiver[_IS_BAD_STATE])
     for travel in (first, second):
         if travel >= 0:
             if p[_IS_REDUNDANT] == 0.0:
@@ -304,7 +302,7 @@ def packet_delay_steps(p, num_steps):
     """Return the delays (num_steps, 2) of packets and of their duplicates [steps]; -1: none."""
     delays, bad = np.empty((num_steps, 2), np.int64), p[_BAD_STATE_SHARE]
     for k in range(num_steps):
-        bad, delays[k, 0], delays[k, 1] = _draw_loss_and_delays(p, k, bad)
+        bad, delays[k, 0], delays[k, 1] = _random_loss_and_delays(p, k, bad)
     return delays
 
 

@@ -23,17 +23,17 @@ from drake_teleop.station.slave.arm import ArmModel, acceleration_from_specific_
 class ContactDetectionConfig:
     """Settings of the contact detector."""
 
-    statistic: str = choice("glr", STATISTIC_NAMES, "statistic that is compared with the threshold")
+    statistic: str = choice("glr", STATISTIC_NAMES, "statistic of the contact wrench for detection")
     margin: float = quantity(
-        THRESHOLD_MARGIN, "1", 1.0, 10.0, "ratio of threshold to the largest value in free motion"
+        THRESHOLD_MARGIN, "1", 1.0, 10.0, "ratio of threshold to largest statistic in free motion"
     )
     hold: float = quantity(0.02, "s", 0.0, 1.0, "time below the threshold that ends a contact")
-    drift_time: float = quantity(5.0, "s", 0.5, 1e4, "time constant of the subtracted mean")
+    drift_time: float = quantity(5.0, "s", 0.5, 1e4, "time constant that removes wrench drift")
     recovery: float = quantity(5e-3, "s", 0.0, 1.0, "pause of the detection after a saturation")
 
 
 @njit(cache=True)
-def _detect_contact_using_arm(memory, sample, estimate, arm, settings):
+def _detect_with_joint_angles(memory, sample, estimate, arm, settings):
     s, acceleration = sample[regressor.SAMPLE_SPECIFIC_FORCE], np.empty(3)
     q = sample[regressor.FIRST_JOINT_INDEX : regressor.SAMPLE_TIME_INDEX]
     acceleration_from_specific_force_into(arm, q, s, acceleration)
@@ -42,10 +42,9 @@ def _detect_contact_using_arm(memory, sample, estimate, arm, settings):
 
 @njit(cache=True)
 def update_contact_flag_with_sample(memory, sample, estimate, acceleration, settings):
-    """Update a contact detector's `memory` with a sample; return whether there is contact.
+    """Update a contact detector's `memory` with a sensor sample; return whether there is contact.
 
-    `sample` is that of `load.regressor`, `estimate` (16,) [offsets; phi], `acceleration` (3,) of So
-    in S [m/s^2]; `settings` is `ContactDetector.settings`.
+    `estimate` (16,) is [offsets; phi], `acceleration` (3,) that of So in S [m/s^2].
     """
     valid = are_valid_port_values(sample) and are_valid_port_values(estimate)
     if not (valid and are_valid_port_values(acceleration)):
@@ -63,8 +62,7 @@ class ContactDetection(LeafSystem):
 
     The flag keeps its value while the wrist sensor is saturated and for `config.recovery` after.
 
-    Ports are those of `blocks.ContactDetector`, but one input `sample`
-    (`drake_teleop.load.regressor`) replaces the separate signals of the wrist sensor.
+    Ports as `blocks.ContactDetector`, with one input `sample` for all sensor signals.
     """
 
     __slots__ = NO_EXTRA_SLOTS
@@ -95,7 +93,7 @@ class ContactDetection(LeafSystem):
     def _update_and_get_contact_flag(
         self, context: Context, memory: Array, sample: Array, estimate: Array
     ) -> bool:
-        return bool(_detect_contact_using_arm(memory, sample, estimate, self._arm, self._settings))
+        return bool(_detect_with_joint_angles(memory, sample, estimate, self._arm, self._settings))
 
     def _update_contact_flag_state(self, context: Context, discrete_state: DiscreteValues) -> None:
         sample = self._sample.Eval(context)

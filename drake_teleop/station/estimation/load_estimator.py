@@ -31,28 +31,27 @@ class LoadEstimatorConfig:
         "update with every sample; only for free motion: a contact wrench would count as load",
     )
     forgetting: float = quantity(1.0, "1", 0.9, 1.0, "forgetting factor per sample; 1 = none")
-    method: str = choice("rls", (), "rls: least squares; rtls: total, for noisy motion", METHODS)
+    method: str = choice("rls", (), "rls: least squares; rtls: total least squares", METHODS)
     settled_bound: float = quantity(
-        0.05, "1", 1e-6, 10.0, "standard deviation of a settled load relative to its natural scale"
+        0.05, "1", 1e-6, 10.0, "largest relative standard deviation of a settled load"
     )
-    watch: bool = plain(False, "freeze a settled load or one with covariance; detect its change")
+    watch: bool = plain(False, "keep a settled or given load constant; detect its change")
     relative_wrench_error: float = quantity(
-        0.0, "1", 0.0, 0.5, "watch: relative wrench error due to gains, cross-talk and delays"
+        0.0, "1", 0.0, 0.5, "relative wrench error by gains, cross-talk, delays; for `watch`"
     )
 
     def check(self, where: str) -> None:
         if self.enabled and self.watch and not METHODS[self.method].allows_for_noisy_motion:
-            what = f"'{self.method}' ignores the noise of the motion"
-            result = "its covariance is too small to detect a change of load"
+            what = f"'{self.method}' ignores the noise of motion, so it detects no change of load"
             remedy = "set method: rtls, or watch: false"
-            raise DrakeTeleopError(f"{what}, so {result}", where=f"{where}.method", remedy=remedy)
+            raise DrakeTeleopError(what, where=f"{where}.method", remedy=remedy)
 
 
 class LoadEstimator(LeafSystem):
-    """Block with the estimate of load and offsets: constant, updated in every period or monitored.
+    """Block that outputs load and offsets: constant, estimated from all samples, or monitored.
 
-    Ports are those of `blocks.LoadEstimator`, but one input `sample` replaces the separate signals
-    of the wrist sensor. load_state is an index into `load.online.watched.LOAD_STATE_NAMES`.
+    Ports as `blocks.LoadEstimator`, with one input `sample` for all sensor signals. Output
+    load_state is an index into `load.online.watched.LOAD_STATE_NAMES`.
 
     Args:
         noise_std: (6,) standard deviations of the wrench channels, for weighting [N, N m].
@@ -115,7 +114,7 @@ class LoadEstimator(LeafSystem):
         if sample[SATURATION_FLAG_INDEX] > 0.0 or not are_valid_port_values(sample):
             return
         estimate = discrete_state.get_mutable_value(0)
-        if self._read_load_state_code(discrete_state) != STATE_LEARNING:
+        if self._read_code_of_load_state(discrete_state) != STATE_LEARNING:
             memory = discrete_state.get_mutable_value(2)
             watched.monitor_load(estimate, memory, sample, *self._watch_arguments)
             return
@@ -128,12 +127,12 @@ class LoadEstimator(LeafSystem):
             covariance = self._estimator.covariance_of(estimate, memory)
             discrete_state.set_value(2, watched.initial_monitor_memory(estimate, covariance))
 
-    def _read_load_state_code(self, discrete_state: DiscreteValues) -> int:
+    def _read_code_of_load_state(self, discrete_state: DiscreteValues) -> int:
         return int(discrete_state.value(2)[STATE_INDEX]) if self._watches else STATE_LEARNING
 
     def _calc_load_state(self, context: Context, output: BasicVector) -> None:
         state = context.get_discrete_state()
-        output[0] = self._read_load_state_code(state)
+        output[0] = self._read_code_of_load_state(state)
         if not self._watches:
             estimate, memory = state.value(0), state.value(1)
             settled = self._estimator.is_state_settled(estimate, memory.reshape(self._shape))

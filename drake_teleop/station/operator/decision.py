@@ -34,7 +34,7 @@ from drake_teleop.station.operator.perception import (
 DECISION_PERIOD_S = 0.005
 """Period of perception and decision [s]; a submovement takes at least 40 periods by default."""
 
-_OPERATOR_RANDOM_STREAM_NUMBER = 2  # random stream; the network's lines use others
+_OPERATOR_RANDOM_STREAM_ID = 2  # random stream; the network's lines use others
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ OperatorParameters = namedtuple(
 #: Task for compiled code: times, target in W relative to the tool's start, criteria.
 TaskParameters = namedtuple(
     "TaskParameters",
-    "kind start_time timeout goal approach_axis radius dwell standoff force tolerance depth",
+    "kind start_time timeout target_W approach_axis radius dwell standoff force tolerance depth",
     defaults=(0.0, 0.0, 0.0, 0.0),
 )
 
@@ -75,10 +75,10 @@ TaskParameters = namedtuple(
 def pack_operator_parameters(
     training: OperatorTraining, perception: Perception, movement: tasks.Movement
 ) -> OperatorParameters:
-    there_and_back = training.forward_delay_s + training.backward_delay_s + _STATION_RESPONSE_TIME_S
+    there_and_back = training.forward_delay_s + training.backward_delay_s + _STATION_REACTION_TIME_S
     delays = perception.vision_delay + there_and_back, perception.reaction_time + there_and_back
     # 53 bits of a key are exact in a float.
-    key = random_bits(np.uint64(training.seed % 2**64), _OPERATOR_RANDOM_STREAM_NUMBER)
+    key = random_bits(np.uint64(training.seed % 2**64), _OPERATOR_RANDOM_STREAM_ID)
     own = training.R_WB, training.translation_scale, training.force_gain, *delays, key
     errors = ("vision_noise", "depth_error", "aim_error", "weber_fraction")
     vision = [getattr(perception, name) for name in errors]
@@ -119,20 +119,20 @@ _LAST_PRESS_FORCE, _LAST_PRESS_MOTION, _NUM_SLOT_SEARCHES = range(4, 7)
 MEMORY_SIZE = PLAN_SLICE.stop
 
 _STEPS_PER_EYE_FIXATION = 50  # steps of a fixation, 0.25 s
-_STATION_RESPONSE_TIME_S = 0.05  # end of a move to its effect, without network, estimate
-_APPROACH_UPDATE_PERIOD_S = 0.3  # s, update interval of the careful approach, estimate
+_STATION_REACTION_TIME_S = 0.05  # end of a move to its effect, without network, estimate
+_APPROACH_SPEED_UPDATE_PERIOD_S = 0.3  # s, update interval of the careful approach, estimate
 # Largest perceived depth without contact; beyond, the operator gives up; estimate.
-_MAX_FREE_DEPTH_M = 0.03
+_MAX_MISSED_DEPTH_M = 0.03
 _MIN_CONTACT_DETECTION_TRUST = 0.1  # trust with vision only, estimate
 # Contact stiffness that the operator assumes [N/m], estimate.
 _INITIAL_ASSUMED_STIFFNESS, _MIN_ASSUMED_STIFFNESS, _MAX_ASSUMED_STIFFNESS = 2000.0, 200.0, 50000.0
 _MAX_PRESS_CORRECTION_M = 0.003  # m, longest correction of the force, at the tool, estimate
-_MIN_STUCK_FORCE_OVER_PUSH_FORCE = 0.5  # above it the peg is stuck, estimate
+_MIN_STUCK_TO_PUSH_FORCE_RATIO = 0.5  # above it the peg is stuck, estimate
 # Compliance to lateral force [N/m], largest yield [m], estimates.
 _LATERAL_YIELD_STIFFNESS, _MAX_LATERAL_YIELD_M = 5000.0, 0.0015
 # Spiral of the search: radius [m] over sqrt(number of searches), estimate; golden angle [rad].
 _SEARCH_SPIRAL_SCALE_M, _GOLDEN_ANGLE_RAD = 0.5e-3, 2.399963
-_FLOOR_DEPTH_SHARE = 0.8  # share of the depth beyond which contact counts as the floor, estimate
+_FLOOR_DEPTH_RATIO = 0.8  # share of the depth beyond which contact counts as the floor, estimate
 
 
 def initial_memory() -> Array:
@@ -153,7 +153,7 @@ def _tool_to_hand_motion(person, tool_motion_W):
 
 
 @njit(cache=True)
-def _draw_normal_number(person, step, draw):
+def _normal_random_number(person, step, draw):
     return random_normal(np.uint64(person.random_key), 16 * step + draw)
 
 
@@ -164,7 +164,7 @@ def observe_tool_into(person, step, displacement_W, seen_W):
     It is the true `displacement_W` plus an error that is constant for 50 steps (an eye fixation).
     """
     for i in range(3):
-        draw = _draw_normal_number(person, step // _STEPS_PER_EYE_FIXATION, 4 + i)
+        draw = _normal_random_number(person, step // _STEPS_PER_EYE_FIXATION, 4 + i)
         seen_W[i] = displacement_W[i] + person.vision_noise * draw
 
 
@@ -176,7 +176,7 @@ def _plan_submovement(person, memory, step, time, error_W):
     duration = math.sqrt(10.0 / math.sqrt(3.0) * length / person.acceleration)
     duration = max(duration, person.shortest)
     for i in range(3):
-        change[i] += person.noise * length * _draw_normal_number(person, step, i)
+        change[i] += person.noise * length * _normal_random_number(person, step, i)
     plan_move(memory, time, duration, change, np.zeros(3))
     return duration
 
@@ -188,7 +188,7 @@ def _contact_force_at_tool_along_approach(task, person, sensed):
 
 
 @njit(cache=True)
-def _update_and_check_criterion(memory, time, is_met, is_nearly_met):
+def _update_dwell_and_check_criterion(memory, time, is_met, is_nearly_met):
     if memory[_CRITERION_MET_SINCE] < 0.0 and is_met:
         memory[_CRITERION_MET_SINCE] = time
     elif not is_nearly_met:
@@ -243,7 +243,7 @@ def update_decision(task, person, time, seen_W, sensed, state, memory):
         if task.kind == tasks.KIND_PRESS:
             _enter_phase(state, memory, PHASE_PRESSING, time)
         elif (
-            _update_and_check_criterion(memory, time, True, True)
+            _update_dwell_and_check_criterion(memory, time, True, True)
             and time - memory[_CRITERION_MET_SINCE] >= task.dwell
         ):
             _finish_task(state, memory, time, 1.0)
@@ -257,16 +257,16 @@ def update_decision(task, person, time, seen_W, sensed, state, memory):
 def _perceived_standoff_target_W(task, person):
     depth = 0.0
     if task.kind != tasks.KIND_REACH:
-        depth = person.depth_error * _draw_normal_number(person, 0, 15)
-    target = task.goal + (depth - task.standoff) * task.approach_axis
+        depth = person.depth_error * _normal_random_number(person, 0, 15)
+    target = task.target_W + (depth - task.standoff) * task.approach_axis
     if task.kind == tasks.KIND_INSERT:
         for i in range(2):
-            target[i] += person.aim_error * _draw_normal_number(person, 0, 13 + i)
+            target[i] += person.aim_error * _normal_random_number(person, 0, 13 + i)
     return target
 
 
 @njit(cache=True)
-def _perceived_depth_beyond_surface(task, person, seen_W):
+def _perceived_tool_depth_m(task, person, seen_W):
     target, beyond = _perceived_standoff_target_W(task, person), -task.standoff
     for i in range(3):
         beyond += (seen_W[i] - target[i]) * task.approach_axis[i]
@@ -278,7 +278,7 @@ def _move_to_target_by_vision(task, person, step, time, seen_W, state, memory):
     error = _perceived_standoff_target_W(task, person) - seen_W
     off = math.sqrt(dot(error, error))
     inside, still_inside = off <= 0.8 * task.radius, off <= task.radius
-    met = _update_and_check_criterion(memory, time, inside, still_inside)
+    met = _update_dwell_and_check_criterion(memory, time, inside, still_inside)
     if task.kind == tasks.KIND_REACH:
         if met and time - memory[_CRITERION_MET_SINCE] >= task.dwell:
             _finish_task(state, memory, time, 1.0)
@@ -300,27 +300,27 @@ def _approach_contact(task, person, time, seen_W, sensed, state, memory):
         phase = PHASE_SEARCHING_SLOT if inserts else PHASE_STOPPING
         _enter_phase(state, memory, phase, time + STOP_DURATION_S + person.force_delay)
         return
-    if _perceived_depth_beyond_surface(task, person, seen_W) > task.depth + _MAX_FREE_DEPTH_M:
+    if _perceived_tool_depth_m(task, person, seen_W) > task.depth + _MAX_MISSED_DEPTH_M:
         _finish_task(state, memory, time, -1.0)
     elif time >= memory[_NEXT_MOVE_TIME]:
         speed_W = state[CONTACT_TRUST_INDEX] * person.approach_speed
         speed, change = _tool_to_hand_motion(person, speed_W * task.approach_axis), np.empty(3)
         for i in range(3):
             now = evaluate_plan(memory[PLAN_SLICE], time, i)[1]
-            change[i] = 0.5 * _APPROACH_UPDATE_PERIOD_S * (now + speed[i])
-        plan_move(memory, time, _APPROACH_UPDATE_PERIOD_S, change, speed)
-        memory[_NEXT_MOVE_TIME] = time + _APPROACH_UPDATE_PERIOD_S
+            change[i] = 0.5 * _APPROACH_SPEED_UPDATE_PERIOD_S * (now + speed[i])
+        plan_move(memory, time, _APPROACH_SPEED_UPDATE_PERIOD_S, change, speed)
+        memory[_NEXT_MOVE_TIME] = time + _APPROACH_SPEED_UPDATE_PERIOD_S
 
 
 @njit(cache=True)
 def _perceived_contact_force(task, person, sensed, memory):
-    draw = _draw_normal_number(person, int(memory[_NEXT_MOVE_TIME] / DECISION_PERIOD_S), 3)
+    draw = _normal_random_number(person, int(memory[_NEXT_MOVE_TIME] / DECISION_PERIOD_S), 3)
     error = person.weber_fraction * draw
     return (1.0 + error) * _contact_force_at_tool_along_approach(task, person, sensed)
 
 
 @njit(cache=True)
-def _calc_press_correction_m(task, memory, force):
+def _calc_hand_displacement_for_press_m(task, memory, force):
     effect = force - memory[_LAST_PRESS_FORCE]
     if effect * memory[_LAST_PRESS_MOTION] > 0.0:
         stiffness = 0.5 * (memory[_ASSUMED_CONTACT_STIFFNESS] + effect / memory[_LAST_PRESS_MOTION])
@@ -338,11 +338,11 @@ def _control_press_force(task, person, step, time, sensed, state, memory):
     force = _perceived_contact_force(task, person, sensed, memory)
     error = abs(task.force - force)
     is_met, is_nearly_met = error <= 0.5 * task.tolerance, error <= task.tolerance
-    met = _update_and_check_criterion(memory, time, is_met, is_nearly_met)
+    met = _update_dwell_and_check_criterion(memory, time, is_met, is_nearly_met)
     if met and time - memory[_CRITERION_MET_SINCE] >= task.dwell:
         _finish_task(state, memory, time, 1.0)
     elif not met and time >= memory[_NEXT_MOVE_TIME]:
-        move = _calc_press_correction_m(task, memory, force)
+        move = _calc_hand_displacement_for_press_m(task, memory, force)
         duration = _plan_submovement(person, memory, step, time, move * task.approach_axis)
         memory[_NEXT_MOVE_TIME] = time + duration + person.force_delay
 
@@ -359,7 +359,7 @@ def _lateral_contact_force_W_and_norm(task, person, sensed):
 
 @njit(cache=True)
 def _is_tool_stuck(task, person, sensed):
-    limit = _MIN_STUCK_FORCE_OVER_PUSH_FORCE * task.force
+    limit = _MIN_STUCK_TO_PUSH_FORCE_RATIO * task.force
     _, sideways = _lateral_contact_force_W_and_norm(task, person, sensed)
     return _contact_force_at_tool_along_approach(task, person, sensed) >= limit or sideways >= limit
 
@@ -376,11 +376,11 @@ def _search_slot(task, person, step, time, seen_W, sensed, state, memory):
     if not (state[CONTACT_PERCEIVED_INDEX] > 0.0 and _is_tool_stuck(task, person, sensed)):
         _enter_phase(state, memory, PHASE_APPROACHING, time)
         return
-    deep = _perceived_depth_beyond_surface(task, person, seen_W) >= _FLOOR_DEPTH_SHARE * task.depth
-    if deep and abs(force - task.force) <= _MIN_STUCK_FORCE_OVER_PUSH_FORCE * task.force:
+    deep = _perceived_tool_depth_m(task, person, seen_W) >= _FLOOR_DEPTH_RATIO * task.depth
+    if deep and abs(force - task.force) <= _MIN_STUCK_TO_PUSH_FORCE_RATIO * task.force:
         _enter_phase(state, memory, PHASE_STOPPING, time)
         return
-    push = _calc_press_correction_m(task, memory, force)
+    push = _calc_hand_displacement_for_press_m(task, memory, force)
     move, sideways = _lateral_contact_force_W_and_norm(task, person, sensed)
     if sideways >= state[FORCE_THRESHOLD_INDEX] / person.force_gain:
         move *= min(1.0 / _LATERAL_YIELD_STIFFNESS, _MAX_LATERAL_YIELD_M / sideways)

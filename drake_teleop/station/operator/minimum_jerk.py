@@ -31,7 +31,7 @@ def evaluate_plan(plan, time, axis):
 
 @njit(cache=True)
 def add_planned_motion_into(memory, time, pose, twist):
-    """Add the displacement and velocity of the plan in `memory` to a pose (7,) and twist (6,)."""
+    """Add the plan's motion at `time` [s] to the hand's pose (7,) and twist (6,) in B."""
     for i in range(3):
         x, v, _ = evaluate_plan(memory[PLAN_SLICE], time, i)
         pose[4 + i] += x

@@ -61,7 +61,7 @@ class MinimumJerk:
     duration: float = quantity(1.0, "s", 1e-3, 1e6, "duration of the move")
     translation: list[float] = quantity([0.0, 0.0, 0.0], "m", -1.0, 1.0, "displacement in B")
     rotation: list[float] = quantity(
-        [0.0, 0.0, 0.0], "rad", -3.14, 3.14, "rotation vector of the offset, about axes of B"
+        [0.0, 0.0, 0.0], "rad", -3.14, 3.14, "rotation vector, about axes of the master's base B"
     )
 
 
@@ -75,12 +75,12 @@ class Sine:
 
     t_start: float = quantity(0.0, "s", 0.0, 1e6, "start of the first ramp")
     duration: float = quantity(1.0, "s", 1e-3, 1e6, "duration, both ramps included")
-    ramp: float = quantity(0.1, "s", 1e-3, 1e6, "length of each ramp, at most half the duration")
+    ramp: float = quantity(0.1, "s", 1e-3, 1e6, "time of each ramp, at most half of duration")
     frequency: float = quantity(1.0, "Hz", 0.0, 100.0, "frequency")
     phase: float = quantity(0.0, "rad", -7.0, 7.0, "phase at t_start")
     translation: list[float] = quantity([0.0, 0.0, 0.0], "m", -1.0, 1.0, "amplitude in B")
     rotation: list[float] = quantity(
-        [0.0, 0.0, 0.0], "rad", -3.14, 3.14, "rotation vector of the amplitude, about axes of B"
+        [0.0, 0.0, 0.0], "rad", -3.14, 3.14, "amplitude as rotation vector, about axes of base B"
     )
 
 
@@ -89,10 +89,10 @@ class Sine:
 class OperatorConfig:
     """Settings of the operator: grip, intended motion and task."""
 
-    grip: str = choice("medium", tuple(GRIP_IMPEDANCES), "stiffness, damping and mass of the hand")
-    intent: list[MinimumJerk | Sine] = plain([], "moves relative to the start pose; they add up")
+    grip: str = choice("medium", tuple(GRIP_IMPEDANCES), "grip: preset of the hand's impedance")
+    intent: list[MinimumJerk | Sine] = plain([], "hand movements from the start pose, summed")
     task: Reach | Touch | Press | Insert | None = plain(
-        None, "task with vision and force perception, in addition to the intent"
+        None, "task by vision and force perception; its motion adds to `intent`"
     )
     perception: Perception = field(default_factory=Perception)
     movement: Movement = field(default_factory=Movement)
@@ -265,7 +265,7 @@ class Operator(LeafSystem):
           the rendered force [N], trust in detecting contact, 0.1 to 1 (with a task)
 
     The intended motion is relative to the pose X_BE `start` (7,). A task requires training, the
-    slave's arm, and `tip` (6,), the position of the tool's tip in S and at the start in W [m].
+    slave's arm, and `tip` (6,): position of the tool's tip in S, and at the start in W [m].
     """
 
     __slots__ = NO_EXTRA_SLOTS
@@ -290,7 +290,7 @@ class Operator(LeafSystem):
         self._has_task = config.task is not None
         self._pose = self.DeclareVectorInputPort("pose_master", 7)
         self._twist = self.DeclareVectorInputPort("twist_master", 6)
-        moving = self._declare_intended_motion_sources() | {self.time_ticket()}
+        moving = self._declare_intended_motion_ports() | {self.time_ticket()}
         if config.task is not None:
             if training is None or arm is None or tip is None:
                 raise ValueError("Operator: a task requires the arguments training, arm and tip")
@@ -301,7 +301,7 @@ class Operator(LeafSystem):
             self._perceived_forces = _make_delay_buffer(senses.reaction_time, nothing_felt)
             person = decision.pack_operator_parameters(training, senses, config.movement)
             task_and_person = decision.pack_task_parameters(config.task), person
-            hand_and_arm = senses.compiled_parameters(period), hand.mass, arm.table
+            hand_and_arm = senses.packed_for_compiled_code(period), hand.mass, arm.table
             self._task_parameters = (*task_and_person, *hand_and_arm, np.array(tip, dtype=float))
             self._joints = arm.num_joints
             self._slave = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
@@ -317,7 +317,7 @@ class Operator(LeafSystem):
         self._wrench = self.DeclareVectorOutputPort("hand_wrench_E", 6, calc, held | moving)
         self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intended_pose), moving)
 
-    def _declare_intended_motion_sources(self) -> set[DependencyTicket]:
+    def _declare_intended_motion_ports(self) -> set[DependencyTicket]:
         # `LiveHand` replaces these ports by a path to external targets.
         pose = self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
         twist = self._intended_twist = self.DeclareVectorInputPort("intended_twist", 6)
@@ -332,7 +332,7 @@ class Operator(LeafSystem):
         _update_operator_perception_and_decision(*self._task_parameters, *inputs, slave_q, *state)
 
     def _evaluate_intent(self, context: Context) -> tuple[Array, ...]:
-        """Return segments, the pose and twist they are relative to, and the decision memory."""
+        """Return packed motion segments, their reference pose and twist, and decision memory."""
         memory = self._no_memory
         if self._has_task:
             memory = context.get_discrete_state(self._groups[1]).value()

@@ -23,16 +23,16 @@ _INITIAL_FORCE_MODEL_STD = np.array([0.5, 2.0, 0.1, 0.5, 0.5, 0.5])
 _FORCE_NOISE_DENSITY_N_PER_SQRT_HZ = 0.007
 _FRICTION_SMOOTHING_SPEED_M_PER_S = 0.01  # m/s, v_0, about the value of the device's friction
 _FORCE_MODEL_SIZE = 6
-_MAX_TIME_STEP_DEVIATION = 0.1  # of a record, relative to the median step
+_MAX_RELATIVE_TIME_STEP_DEVIATION = 0.1  # of a record, relative to the median step
 
 # Memory: filtered u and v, now and one sample ago (12), held |u_expected|, number of samples,
 # estimate [m, b, c, u_0 (3)], covariance of the estimate.
-_MASKING_FORCE, _SAMPLE_COUNT, _FORCE_MODEL_START = 12, 13, 14
-_COVARIANCE_START = _FORCE_MODEL_START + _FORCE_MODEL_SIZE
-PERCEPTION_MEMORY_SIZE = _COVARIANCE_START + _FORCE_MODEL_SIZE**2
+_MASKING_FORCE_INDEX, _SAMPLE_COUNT, _FORCE_MODEL_START_INDEX = 12, 13, 14
+_COVARIANCE_START_INDEX = _FORCE_MODEL_START_INDEX + _FORCE_MODEL_SIZE
+PERCEPTION_MEMORY_SIZE = _COVARIANCE_START_INDEX + _FORCE_MODEL_SIZE**2
 """Size of the memory of `update_perception_into`."""
 
-EXCESS_FORCE_START, DETECTION_THRESHOLD_INDEX, CONTACT_NOTICED_INDEX, OUTPUT_SIZE = 0, 3, 4, 5
+EXCESS_FORCE_START_INDEX, DETECTION_THRESHOLD_INDEX, CONTACT_NOTICED_INDEX, OUTPUT_SIZE = 0, 3, 4, 5
 """Indices of the output of `update_perception_into`, and its size."""
 
 
@@ -46,15 +46,15 @@ class Perception:
     masking_time: float = quantity(0.3, "s", 1e-3, 10.0, "decay time constant of masking")
     bandwidth_hz: float = quantity(20.0, "Hz", 1.0, 50.0, "bandwidth of perceived force and motion")
     reaction_time: float = quantity(0.16, "s", 0.0, 1.0, "time from a force to the hand's reaction")
-    vision_delay: float = quantity(0.15, "s", 0.0, 1.0, "time from vision to the hand's reaction")
+    vision_delay: float = quantity(0.15, "s", 0.0, 1.0, "time from a seen motion to the reaction")
     vision_noise: float = quantity(
         0.5e-3, "m", 0.0, 0.1, "standard deviation of a perceived position, at the tool"
     )
     depth_error: float = quantity(2e-3, "m", 0.0, 0.1, "standard deviation of a perceived depth")
-    aim_error: float = quantity(1e-3, "m", 0.0, 0.1, "standard deviation of a slot's xy position")
+    aim_error: float = quantity(1e-3, "m", 0.0, 0.1, "standard deviation of perceived slot x and y")
 
-    def compiled_parameters(self, dt: float) -> Array:
-        """Return (4,): Weber fraction, threshold [N]; masking decay, low-pass gain per `dt` [s]."""
+    def packed_for_compiled_code(self, dt: float) -> Array:
+        """Return Weber fraction, threshold [N], masking decay, low-pass gain per `dt` [s]."""
         fade = math.exp(-dt / self.masking_time)
         smooth = -math.expm1(-2 * math.pi * self.bandwidth_hz * dt)
         return np.array([self.weber_fraction, self.absolute_threshold, fade, smooth])
@@ -62,7 +62,7 @@ class Perception:
 
 def initial_memory() -> Array:
     memory = np.zeros(PERCEPTION_MEMORY_SIZE)
-    memory[_COVARIANCE_START:] = np.diag(_INITIAL_FORCE_MODEL_STD**2).ravel()
+    memory[_COVARIANCE_START_INDEX:] = np.diag(_INITIAL_FORCE_MODEL_STD**2).ravel()
     return memory
 
 
@@ -82,7 +82,7 @@ def update_perception_into(memory, parameters, dt, hand_mass, hand_force, veloci
     for i in range(3):
         if first:
             memory[i], memory[3 + i] = -hand_force[i], velocity[i]
-            memory[_FORCE_MODEL_START + 3 + i] = -hand_force[i]
+            memory[_FORCE_MODEL_START_INDEX + 3 + i] = -hand_force[i]
         memory[6 + i], memory[9 + i] = memory[i], memory[3 + i]
         memory[i] += smooth * (-hand_force[i] - memory[i])
         memory[3 + i] += smooth * (velocity[i] - memory[3 + i])
@@ -92,7 +92,8 @@ def update_perception_into(memory, parameters, dt, hand_mass, hand_force, veloci
     for i in range(3):
         speed += 0.25 * (memory[3 + i] + memory[9 + i]) ** 2
     speed = math.sqrt(speed)
-    theta, expected_square, excess_square = memory[_FORCE_MODEL_START:_COVARIANCE_START], 0.0, 0.0
+    theta = memory[_FORCE_MODEL_START_INDEX:_COVARIANCE_START_INDEX]
+    expected_square = excess_square = 0.0
     rows, excess = np.zeros((3, _FORCE_MODEL_SIZE)), out[:3]
     for i in range(3):
         v = 0.5 * (memory[3 + i] + memory[9 + i])
@@ -105,12 +106,13 @@ def update_perception_into(memory, parameters, dt, hand_mass, hand_force, veloci
         excess[i] = felt - expected
         expected_square += expected * expected
         excess_square += excess[i] * excess[i]
-    memory[_MASKING_FORCE] = max(math.sqrt(expected_square), fade * memory[_MASKING_FORCE])
-    out[DETECTION_THRESHOLD_INDEX] = max(absolute, weber * memory[_MASKING_FORCE])
+    masking = max(math.sqrt(expected_square), fade * memory[_MASKING_FORCE_INDEX])
+    memory[_MASKING_FORCE_INDEX] = masking
+    out[DETECTION_THRESHOLD_INDEX] = max(absolute, weber * masking)
     noticed = attentive and math.sqrt(excess_square) >= out[DETECTION_THRESHOLD_INDEX]
     out[CONTACT_NOTICED_INDEX] = 1.0 if noticed else 0.0
     if not noticed:
-        P = memory[_COVARIANCE_START:].reshape(_FORCE_MODEL_SIZE, _FORCE_MODEL_SIZE)
+        P = memory[_COVARIANCE_START_INDEX:].reshape(_FORCE_MODEL_SIZE, _FORCE_MODEL_SIZE)
         _update_force_model_by_kalman_filter(theta, P, rows, excess, dt)
 
 
@@ -169,10 +171,10 @@ def perceive_contact(
     times = finite_array("t", t, len(force))
     steps, out = np.diff(times), np.empty((len(times), OUTPUT_SIZE))
     dt = float(np.median(steps)) if len(steps) else 0.0
-    if dt <= 0.0 or np.abs(steps - dt).max() > _MAX_TIME_STEP_DEVIATION * dt:
+    if dt <= 0.0 or np.abs(steps - dt).max() > _MAX_RELATIVE_TIME_STEP_DEVIATION * dt:
         remedy = "give two samples or more, with steps within 10 % of their median"
         raise DrakeTeleopError("times do not increase in even steps", where="t", remedy=remedy)
-    parameters = perception.compiled_parameters(dt)
+    parameters = perception.packed_for_compiled_code(dt)
     _perceive_contact_of_recorded_motion(
         times, force, speed, parameters, dt, hand_mass, attentive, initial_memory(), out
     )

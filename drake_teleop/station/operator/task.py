@@ -10,7 +10,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 
 @dataclass
 class _Task:
-    t_start: float = quantity(0.5, "s", 0.0, 1e6, "start, after the start of the simulation")
+    t_start: float = quantity(0.5, "s", 0.0, 1e6, "start of the task, from simulation start")
     timeout: float = quantity(10.0, "s", 0.1, 3600.0, "time after which the operator gives up")
     translation: list[float] = quantity(
         [0.0, 0.0, -0.1], "m", -2.0, 2.0, "displacement from the tool's start to the target, in W"
@@ -33,7 +33,7 @@ class Reach(_Task):
 
 @dataclass
 class _ContactTask(_Task):
-    standoff: float = quantity(0.015, "m", 0.0, 0.5, "distance from target for a careful approach")
+    standoff: float = quantity(0.015, "m", 0.0, 0.5, "careful approach within this target distance")
 
 
 @settings
@@ -41,17 +41,17 @@ class _ContactTask(_Task):
 class Touch(_ContactTask):
     """Task: approach a surface at the target, detect contact, and stop."""
 
-    dwell: float = quantity(0.3, "s", 0.0, 10.0, "time at rest after the stop")
+    dwell: float = quantity(0.3, "s", 0.0, 10.0, "rest time of the tool after its stop")
 
 
 @settings
 @dataclass
 class Press(_ContactTask):
-    """Task: approach a surface at the target and press on it with a set force."""
+    """Task: approach a surface at the target and press on it with a desired force."""
 
-    force: float = quantity(8.0, "N", 0.1, 500.0, "set force of the tool on the surface")
-    tolerance: float = quantity(2.0, "N", 0.05, 100.0, "tolerance of the set force")
-    hold: float = quantity(1.0, "s", 0.0, 60.0, "duration of the set force")
+    force: float = quantity(8.0, "N", 0.1, 500.0, "desired force of the tool on the surface")
+    tolerance: float = quantity(2.0, "N", 0.05, 100.0, "tolerance of the desired force")
+    hold: float = quantity(1.0, "s", 0.0, 60.0, "duration of the desired force")
 
 
 @settings
@@ -62,7 +62,7 @@ class Insert(_ContactTask):
     timeout: float = quantity(20.0, "s", 0.1, 3600.0, "time after which the operator gives up")
     depth: float = quantity(0.04, "m", 1e-3, 0.5, "depth of the slot")
     push: float = quantity(10.0, "N", 0.1, 500.0, "downward force of the tool in the slot")
-    dwell: float = quantity(0.3, "s", 0.0, 10.0, "time at rest on the floor")
+    dwell: float = quantity(0.3, "s", 0.0, 10.0, "rest time on the floor of the slot")
 
 
 Task: TypeAlias = Reach | Touch | Press | Insert
@@ -83,9 +83,9 @@ class Movement:
 
     acceleration: float = quantity(1.5, "m/s^2", 0.01, 50.0, "peak acceleration in a submovement")
     shortest: float = quantity(0.2, "s", 0.05, 2.0, "least duration of a submovement")
-    noise: float = quantity(0.05, "1", 0.0, 0.5, "standard deviation of the end point / length")
+    noise: float = quantity(0.05, "1", 0.0, 0.5, "end-point standard deviation per move length")
     approach_speed: float = quantity(
-        0.03, "m/s", 1e-3, 1.0, "speed of the tool in a careful approach, at full trust"
+        0.03, "m/s", 1e-3, 1.0, "tool speed in a careful approach, at full trust in touch"
     )
     gentle_force: float = quantity(2.0, "N", 0.01, 100.0, "harmless contact force at the tool")
 

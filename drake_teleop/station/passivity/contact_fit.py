@@ -38,9 +38,8 @@ def update_contact_fit(sums, force_change, displacement, speed_change, kept_weig
 def force_without_slip_steps(rendered, measured, explained_change, removed_share, max_difference):
     """Return the contact force to render [N], without the steps that stick-slip friction causes.
 
-    The last rendered force, `rendered` [N], changes by `explained_change` [N], caused by depth and
-    speed. Then `removed_share` of its difference from the measured force [N] is removed; at most
-    `max_difference` [N] remains.
+    The last force, `rendered` [N], changes by `explained_change` [N] due to depth and speed. It
+    then approaches `measured` [N] by `removed_share`, to at most `max_difference` [N].
     """
     rendered += explained_change
     rendered += min(removed_share, 1.0) * (measured - rendered)
@@ -48,10 +47,10 @@ def force_without_slip_steps(rendered, measured, explained_change, removed_share
 
 
 @njit(cache=True)
-def force_change_by_slip(force_change, largest_change, max_change):
-    """Return the part of a force change [N] outside 0 to `largest_change`, limited to `max_change`.
+def force_change_by_slip(force_change, elastic_change, max_change):
+    """Return the part of a force change [N] that no elastic contact explains.
 
-    The largest stiffness causes `largest_change` [N]; slip may cause the rest.
+    An elastic contact causes 0 to `elastic_change`. The result is at most `max_change`.
     """
-    rest = force_change - min(max(force_change, min(largest_change, 0.0)), max(largest_change, 0.0))
-    return min(max(rest, -max_change), max_change)
+    elastic = min(max(force_change, min(elastic_change, 0.0)), max(elastic_change, 0.0))
+    return min(max(force_change - elastic, -max_change), max_change)

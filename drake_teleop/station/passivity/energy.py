@@ -10,7 +10,7 @@ from drake_teleop.common.numeric import Array, float_array
 from drake_teleop.station.passivity.packet import dot_of_group, pose_difference_into
 
 #: Value of `pair` -> weight of f_k; the weight of f_(k-1) is the rest to 1.
-WEIGHT_OF_PRESENT_WRENCH = {"held": 0.0, "backward": 1.0, "mean": 0.5}
+NEW_WRENCH_SHARES = {"held": 0.0, "backward": 1.0, "mean": 0.5}
 
 
 def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
@@ -19,10 +19,10 @@ def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
     Args:
         wrench: (N, 6) [f; tau], in W [N, N m].
         pose: (N, 7) pose of the body [qw qx qy qz px py pz], in W, at the same instants.
-        pair: wrench used from k-1 to k: `held` f_(k-1), `backward` f_k, or the `mean` of both.
+        pair: wrench between k-1 and k: "held" f_(k-1), "backward" f_k, or the "mean" of both.
     """
-    if pair not in WEIGHT_OF_PRESENT_WRENCH:
-        remedy = f"choose one of {', '.join(WEIGHT_OF_PRESENT_WRENCH)}"
+    if pair not in NEW_WRENCH_SHARES:
+        remedy = f"choose one of {', '.join(NEW_WRENCH_SHARES)}"
         raise DrakeTeleopError(f"'{pair}' is unknown", where="pair", remedy=remedy)
     wrench = np.ascontiguousarray(float_array("wrench", wrench))
     pose = np.ascontiguousarray(float_array("pose", pose))
@@ -31,16 +31,16 @@ def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
         remedy = "give one wrench and one pose for each of the N samples"
         raise DrakeTeleopError(what, where="wrench, pose", remedy=remedy)
     work = np.zeros((len(wrench), 2))
-    _cumulative_work_into(wrench, pose, WEIGHT_OF_PRESENT_WRENCH[pair], work)
+    _cumulative_work_into(wrench, pose, NEW_WRENCH_SHARES[pair], work)
     return work
 
 
 @njit(cache=True)
-def _cumulative_work_into(wrench, pose, present_weight, work):
+def _cumulative_work_into(wrench, pose, new_wrench_share, work):
     dx, f = np.zeros(6), np.zeros(6)
     for k in range(1, len(wrench)):
         pose_difference_into(pose[k], pose[k - 1], dx)
         for i in range(6):
-            f[i] = wrench[k - 1, i] + present_weight * (wrench[k, i] - wrench[k - 1, i])
+            f[i] = wrench[k - 1, i] + new_wrench_share * (wrench[k, i] - wrench[k - 1, i])
         for g in range(2):
             work[k, g] = work[k - 1, g] + dot_of_group(f, dx, g)

@@ -14,7 +14,7 @@ from drake_teleop.station.passivity import none
 from drake_teleop.station.passivity.memory import SLAVE_PER_MASTER_MOTION, own_parameters
 from drake_teleop.station.passivity.packet import limit_group
 
-_HAND_WRENCH_LIMIT = own_parameters().vector(2)  # in the master's power units [N, N m]
+_WRENCH_LIMIT_SLICE = own_parameters().vector(2)  # in the master's power units [N, N m]
 
 
 @settings
@@ -26,11 +26,11 @@ class ForceLimitConfig:
     torque: float = quantity(0.03, "N m", 0.0, 1e3, "largest torque at the hand")
 
     def pack_into(self, p: Array) -> None:
-        p[_HAND_WRENCH_LIMIT] = np.divide([self.force, self.torque], p[SLAVE_PER_MASTER_MOTION])
+        p[_WRENCH_LIMIT_SLICE] = np.divide([self.force, self.torque], p[SLAVE_PER_MASTER_MOTION])
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     none.master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet)
     for g in range(2):
-        limit_group(wrench, g, p[_HAND_WRENCH_LIMIT][g])
+        limit_group(wrench, g, p[_WRENCH_LIMIT_SLICE][g])

@@ -14,10 +14,10 @@ from drake_teleop.station.passivity import packet as fields
 from drake_teleop.station.passivity.packet import fill_packet, pose_difference_into
 
 # Parameters; pairs are for translation and rotation.
-_layout = slots.own_parameters()
-_COUPLING_STIFFNESS, _COUPLING_DAMPING = _layout.vector(2), _layout.vector(2)
-_SLAVE_FEEDBACK_GAIN, _HAND_FEEDBACK_GAIN = _layout.number(), _layout.number()
-_SPRING_DEFLECTION_OR_COMMAND_SHIFT = slots.own_memory().vector(6)
+_parameter_slots = slots.own_parameters()
+_COUPLING_STIFFNESS, _COUPLING_DAMPING = map(_parameter_slots.vector, (2, 2))
+_SLAVE_FEEDBACK_GAIN, _HAND_FEEDBACK_GAIN = _parameter_slots.numbers(2)
+_DEFLECTION_OR_SHIFT_SLICE = slots.own_memory().vector(6)
 
 
 @settings
@@ -27,18 +27,18 @@ class FourChannelConfig:
 
     stiffness: list[float] = quantity(
         [100.0, 1.0], "N/m, N m/rad", 0.0, 1e6,
-        "stiffness of C_m, the spring between the hand and the received pose of the slave",
+        "spring between the hand and the received pose of the slave (C_m)",
     )  # fmt: skip
     damping: list[float] = quantity(
-        [10.0, 0.05], "N s/m, N m s/rad", 0.0, 1e6, "damper of C_m, parallel to its spring"
+        [10.0, 0.05], "N s/m, N m s/rad", 0.0, 1e6, "damper between hand and received slave pose"
     )
     slave_feedback: float = quantity(
         0.0, "1", -1.0, 10.0,
-        "C5, gain of the contact force at the slave; that of the hand's force is C3 = 1 + C5",
+        "local gain C5 of the contact force at the slave; the received hand force has C3 = 1 + C5",
     )  # fmt: skip
     hand_feedback: float = quantity(
         0.0, "1", -1.0, 10.0,
-        "C6, gain of the hand's force at the master; that of the contact force is C2 = 1 + C6",
+        "local gain C6 of the hand force at the master; the received contact force: C2 = 1 + C6",
     )  # fmt: skip
 
     def pack_into(self, p: Array) -> None:
@@ -48,7 +48,7 @@ class FourChannelConfig:
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    difference = memory[_SPRING_DEFLECTION_OR_COMMAND_SHIFT]
+    difference = memory[_DEFLECTION_OR_SHIFT_SLICE]
     difference[:] = 0.0
     connected = fields.has_packet_arrived(received)
     if connected:
@@ -67,7 +67,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     if fields.has_packet_arrived(received):
-        shift = memory[_SPRING_DEFLECTION_OR_COMMAND_SHIFT]
+        shift = memory[_DEFLECTION_OR_SHIFT_SLICE]
         for i in range(6):
             g, gain = i // 3, p[_SLAVE_FEEDBACK_GAIN]
             force = (1.0 + gain) * received[fields.WRENCH][i] + gain * wrench[i]

@@ -17,20 +17,20 @@ from drake_teleop.station.passivity.packet import dot_of_group, length_of_group,
 ANGLE_PER_LENGTH, TORQUE_PER_FORCE = (1.0, 10.0), (1.0, 0.01)
 UNUSED_SLAVE_RESERVE_SHARE = 0.03  #: share of the slave's reserve that is never used
 SLAVE_RESERVE_SHARE_AT_MASTER = 0.7  #: of the slave's reserve, which the master may hold in contact
-_MIN_KEPT_SLAVE_RESERVE_SHARE = 0.05
+_MIN_SLAVE_RESERVE_SHARE_KEPT_AT_SLAVE = 0.05
 _SERVO_STIFFNESS_FACTOR, _SERVO_DAMPING_FACTOR, SLAVE_MASS_FACTOR = 1.15, 0.9, 1.05
-_MAX_SLAVE_ENERGY_PER_RESERVE = 4.0  # in multiples of the reserve
+_MAX_SLAVE_ENERGY_TO_RESERVE_RATIO = 4.0  # in multiples of the reserve
 _SLAVE_MEASUREMENT_FILTER_S = 3e-3
 _MAX_SLAVE_REST_SPEED_M_PER_S = 0.05  # m/s
 _ENERGY_SEND_RATE_AT_REST, _ENERGY_SEND_RATE = 5.0, 50.0  # 1/s
-_LONGEST_DELAY_DECAY_TIME_CONSTANT_S = 5.0
-_MIN_DISPLAYED_STIFFNESS, _MAX_DISPLAYED_STIFFNESS = 300.0, 1200.0  # N/m
-_ASSUMED_PRESS_SPEED = 0.06  # m/s
+_STORED_DELAY_MAXIMUM_DECAY_S = 5.0
+_MIN_STIFFNESS_AT_HAND, _MAX_STIFFNESS_AT_HAND = 300.0, 1200.0  # N/m
+_ASSUMED_PRESS_SPEED_M_PER_S = 0.06  # m/s
 _MIN_FIT_SAMPLE_LENGTH_M, _MIN_FAST_FIT_SAMPLE_LENGTH_M = 2e-4, 2e-3
 _MIN_FIT_SPAN_M, _MAX_FIT_SPAN_M = 1e-3, 1e-2
-_MIN_SPEED_FOR_FAST_FIT_M_PER_S = 0.15  # m/s
+_FASTER_FORGETTING_SPEED_M_PER_S = 0.15  # m/s
 _STIFFNESS_SHARE_FILTER_S, _STIFFNESS_SHARE_DEADBAND = 0.02, 0.1
-_MIN_LOST_FORCE_OF_REMOVED_WALL_N = 0.3
+_MIN_FORCE_DROP_AT_WALL_REMOVAL_N = 0.3
 _CONTACT_DIRECTION_FILTER_S = 3.0
 _SLIP_FORCE_FADE_S, _FRICTION_DECAY_S = 0.6, 1.0
 _STIFFNESS_GAIN_RISE_S, _STIFFNESS_GAIN_FALL_S = 0.5, 1.0
@@ -44,42 +44,41 @@ _SLAVE_STANDSTILL_SPEED, _MAX_SLAVE_DECELERATION = 2e-3, 20.0  # m/s, m/s^2
 
 # Fields of the slave's packet: k_c, damping b, round trip. Of both packets: level of the sender's
 # ledger. Of the master's packet: number of the newest packet from the slave.
-_method_value_indices = range(fields.METHOD_VALUES.start, fields.METHOD_VALUES.stop)
-PACKET_CONTACT_STIFFNESS, PACKET_CONTACT_DAMPING, PACKET_ROUND_TRIP = _method_value_indices[:3]
-NEWEST_SLAVE_PACKET, PACKET_LEDGER_LEVEL = _method_value_indices[-1], fields.SENDER_ENERGY
+_METHOD_PACKET_INDICES = range(fields.METHOD_VALUES.start, fields.METHOD_VALUES.stop)
+PACKET_CONTACT_STIFFNESS, PACKET_CONTACT_DAMPING, PACKET_ROUND_TRIP = _METHOD_PACKET_INDICES[:3]
+NEWEST_SLAVE_PACKET, PACKET_LEDGER_LEVEL = _METHOD_PACKET_INDICES[-1], fields.SENDER_ENERGY
 
 # Parameters, in the master's power units.
-_layout = slots.own_parameters()
-INITIAL_LEDGER_ENERGY, SLAVE_RESERVE, MASTER_RESERVE = (_layout.vector(2) for _ in range(3))
-DRAG_WRENCH, CONTACT_THRESHOLD, ENCODER_STEP = (_layout.vector(2) for _ in range(3))
-WRENCH_METRIC = _layout.vector(2)  #: weights of squared force and torque in a wrench's norm
+_parameter_slots = slots.own_parameters()
+INITIAL_LEDGER_ENERGY, SLAVE_RESERVE, MASTER_RESERVE = map(_parameter_slots.vector, [2] * 3)
+DRAG_WRENCH, CONTACT_THRESHOLD, ENCODER_STEP = map(_parameter_slots.vector, [2] * 3)
+NORM_WEIGHTS_SLICE = _parameter_slots.vector(2)  #: of squared force and torque in a wrench's norm
 # Memory. Filtered velocity; 1 in contact; mean contact wrench and its direction; servo model.
-_layout = slots.own_memory()
-FILTERED_OWN_VELOCITY, IN_CONTACT_FLAG = _layout.vector(6), _layout.number()
-MEAN_CONTACT_WRENCH, CONTACT_DIRECTION = _layout.vector(6), _layout.vector(6)
-SERVO_MODEL_POSE, _SERVO_MODEL_TWIST = _layout.vector(7), _layout.vector(6)
-_MOTOR_WRENCH = _layout.vector(6)
-_AVAILABLE_MOTOR_ENERGY, _ENERGY_IN_CONTACT = _layout.vector(2), _layout.vector(2)  # A, Q
+_memory_slots = slots.own_memory()
+FILTERED_OWN_VELOCITY, IN_CONTACT_FLAG = _memory_slots.vector(6), _memory_slots.number()
+MEAN_CONTACT_WRENCH, CONTACT_DIRECTION = map(_memory_slots.vector, (6, 6))
+SERVO_MODEL_POSE, _SERVO_MODEL_TWIST = map(_memory_slots.vector, (7, 6))
+_MOTOR_WRENCH_SLICE = _memory_slots.vector(6)
+_AVAILABLE_MOTOR_ENERGY, _ENERGY_IN_CONTACT = map(_memory_slots.vector, (2, 2))  # A, Q
 # k and b of the contact; rho and its goal; c - 1; depth of the slave in the wall.
-_CONTACT_STIFFNESS, _CONTACT_DAMPING = _layout.number(), _layout.number()
-_STIFFNESS_SHARE, _STIFFNESS_SHARE_GOAL, _STIFFNESS_GAIN_MINUS_ONE, _SLAVE_WALL_DEPTH = (
-    _layout.number() for _ in range(4)
-)
+_CONTACT_STIFFNESS, _CONTACT_DAMPING = _memory_slots.numbers(2)
+_STIFFNESS_SHARE, _STIFFNESS_SHARE_GOAL = _memory_slots.numbers(2)
+_STIFFNESS_GAIN_MINUS_ONE, _SLAVE_WALL_DEPTH = _memory_slots.numbers(2)
 # Fit of k and b: filtered force; force and speed at the start of the sample; its length and the
 # lag of its filter; length of the fit and its sums.
-_FILTERED_FORCE, _SAMPLE_START_FORCE, _SAMPLE_START_SPEED = (_layout.number() for _ in range(3))
-_FIT_SAMPLE_LENGTH, _DISPLACEMENT_FILTER_LAG, _FIT_SPAN = (_layout.number() for _ in range(3))
-_FIT_SUMS = _layout.vector(contact_fit.NUM_CONTACT_FIT_SUMS)
+_FILTERED_FORCE, _SAMPLE_START_FORCE, _SAMPLE_START_SPEED = _memory_slots.numbers(3)
+_FIT_SAMPLE_LENGTH, _DISPLACEMENT_FILTER_LAG, _FIT_SPAN = _memory_slots.numbers(3)
+_FIT_SUM_SLICE = _memory_slots.vector(contact_fit.NUM_CONTACT_FIT_SUMS)
 # Present and longest time without packets, longest round trip, period [s].
-_SILENCE_TIME, _LONGEST_SILENCE, _LONGEST_ROUND_TRIP, _PERIOD = (_layout.number() for _ in range(4))
-_CONTACT_WRENCH, _FILTERED_LOAD_WRENCH = _layout.vector(6), _layout.vector(6)
+_SILENCE_TIME, _LONGEST_SILENCE, _LONGEST_ROUND_TRIP, _PERIOD = _memory_slots.numbers(4)
+_CONTACT_WRENCH, _FILTERED_LOAD_WRENCH = map(_memory_slots.vector, (6, 6))
 # Rendered force along n; last speed into the wall; largest friction.
-_RENDERED_FORCE, _LAST_SPEED_INTO_WALL, _MAX_FRICTION_FORCE = (_layout.number() for _ in range(3))
+_RENDERED_FORCE, _LAST_SPEED_INTO_WALL, _MAX_FRICTION_FORCE = _memory_slots.numbers(3)
 
 
 @njit(cache=True)
 def filter_own_velocity(twist, new_weight, memory):
-    """Low-pass filter `FILTERED_OWN_VELOCITY` in `memory`; `new_weight` is that of `twist`."""
+    """Low-pass filter the velocity of this end; `new_weight` is the weight of `twist` (6,)."""
     velocity = memory[FILTERED_OWN_VELOCITY]
     for i in range(6):
         velocity[i] += new_weight * (twist[i] - velocity[i])
@@ -93,13 +92,14 @@ def is_in_contact(wrench, p):
 
 @njit(cache=True)
 def wrench_component_along(a, b, p):
-    """Return the component [N] of wrench `a` (6,) along unit wrench `b` (6,) in `WRENCH_METRIC`."""
-    return p[WRENCH_METRIC][0] * dot_of_group(a, b, 0) + p[WRENCH_METRIC][1] * dot_of_group(a, b, 1)
+    """Return the component [N] of wrench `a` (6,) along `b` (6,) of weighted norm 1."""
+    weights = p[NORM_WEIGHTS_SLICE]
+    return weights[0] * dot_of_group(a, b, 0) + weights[1] * dot_of_group(a, b, 1)
 
 
 @njit(cache=True)
 def work_along(wrench, displacement):
-    """Return wrench (6,) times displacement (6,): work [J], or a length [m] for a unit wrench."""
+    """Return wrench (6,) times displacement (6,): work [J]; for a unit wrench a length [m]."""
     return dot_of_group(wrench, displacement, 0) + dot_of_group(wrench, displacement, 1)
 
 
@@ -133,7 +133,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     memory[_PERIOD] = T
     memory[_SILENCE_TIME] = 0.0 if fresh else memory[_SILENCE_TIME] + T
     silence = memory[_SILENCE_TIME] if connected else 0.0
-    kept = 1.0 - T / _LONGEST_DELAY_DECAY_TIME_CONSTANT_S
+    kept = 1.0 - T / _STORED_DELAY_MAXIMUM_DECAY_S
     memory[_LONGEST_SILENCE] = max(memory[_LONGEST_SILENCE] * kept, silence)
     trip = (memory[slots.STEP_COUNT] - received[NEWEST_SLAVE_PACKET]) * T if connected else 0.0
     memory[_LONGEST_ROUND_TRIP] = max(memory[_LONGEST_ROUND_TRIP] * kept, trip, 0.0)
@@ -148,13 +148,13 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     for i in range(6):
         filtered[i] += share * (load[i] - filtered[i])
     for g in range(2):
-        _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory)
+        _update_slave_energy(g, received, connected, in_contact, twist, dx, wrench, T, p, memory)
     _update_contact_fit_and_rendered_force(received, in_contact, dx, contact, T, p, memory)
     copy_into(memory, slots.LAST_PORT_WRENCH.start, wrench, 0, 6)
     error[:] = 0.0
     if connected:
         fields.pose_difference_into(received[fields.POSE], now, error)
-    fields.pose_difference_into(now, pose, memory[_MOTOR_WRENCH])
+    fields.pose_difference_into(now, pose, memory[_MOTOR_WRENCH_SLICE])
     _update_command_velocity(received, connected, T, p, memory, error)
     for i in range(6):
         error[i] = T * velocity[i]
@@ -182,7 +182,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 
 @njit(cache=True)
-def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory):
+def _update_slave_energy(g, received, connected, in_contact, twist, dx, wrench, T, p, memory):
     # The wrench between two samples is unknown: the smaller of both works is credited.
     work = min(dot_of_group(wrench, dx, g), dot_of_group(memory[slots.LAST_PORT_WRENCH], dx, g))
     new = fields.count_newly_received_energy(g, received, memory)
@@ -200,10 +200,10 @@ def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, 
     if in_contact and speed < _MAX_SLAVE_REST_SPEED_M_PER_S * ANGLE_PER_LENGTH[g]:
         keep, rate = (1.0 - SLAVE_RESERVE_SHARE_AT_MASTER) * reserve, _ENERGY_SEND_RATE_AT_REST
         needed += SLAVE_RESERVE_SHARE_AT_MASTER * reserve
-        returned = min(free - _MIN_KEPT_SLAVE_RESERVE_SHARE * reserve, missing)
+        returned = min(free - _MIN_SLAVE_RESERVE_SHARE_KEPT_AT_SLAVE * reserve, missing)
     returned = max(returned, min(free - keep, needed), 0.0) * min(T * rate, 1.0)
     returned = returned if connected else 0.0
-    lost = max(ledger[g] - returned - _MAX_SLAVE_ENERGY_PER_RESERVE * reserve, 0.0)
+    lost = max(ledger[g] - returned - _MAX_SLAVE_ENERGY_TO_RESERVE_RATIO * reserve, 0.0)
     memory[slots.SENT_ENERGY][g] += returned
     memory[slots.DISSIPATED_ENERGY][g] += lost
     ledger[g] -= returned + lost
@@ -216,15 +216,16 @@ def _servo_lag_s(p):
 
 
 @njit(cache=True)
-def _update_max_displayed_stiffness(received, T, p, memory):
+def _update_max_stiffness_at_hand(received, T, p, memory):
     normal, fill_level = memory[CONTACT_DIRECTION], 0.0
-    depth, base = _ASSUMED_PRESS_SPEED * (memory[_LONGEST_ROUND_TRIP] + _servo_lag_s(p)), math.inf
+    depth = _ASSUMED_PRESS_SPEED_M_PER_S * (memory[_LONGEST_ROUND_TRIP] + _servo_lag_s(p))
+    base = math.inf
     for g in range(2):
         travel = ANGLE_PER_LENGTH[g] * length_of_group(normal, g) * depth
         reserve = p[MASTER_RESERVE][g]
         base = min(base, 2.0 * reserve / max(travel * travel, 1e-300))
         level = min(max(received[PACKET_LEDGER_LEVEL][g] / reserve, 0.0), 1.0)
-        fill_level += p[WRENCH_METRIC][g] * dot_of_group(normal, normal, g) * level
+        fill_level += p[NORM_WEIGHTS_SLICE][g] * dot_of_group(normal, normal, g) * level
     max_silence = _MAX_SILENCE_FOR_GAIN_ROUND_TRIPS * memory[_LONGEST_ROUND_TRIP]
     max_silence = min(max(_MAX_SILENCE_WITH_FEEDFORWARD_S, max_silence), _MAX_SILENCE_FOR_GAIN_S)
     goal = _MAX_STIFFNESS_GAIN * fill_level - 1.0
@@ -237,8 +238,8 @@ def _update_max_displayed_stiffness(received, T, p, memory):
         time_constant = _STIFFNESS_GAIN_RISE_S if change > 0.0 else _STIFFNESS_GAIN_FALL_S
         memory[_STIFFNESS_GAIN_MINUS_ONE] += T / time_constant * change
     gain = 1.0 + memory[_STIFFNESS_GAIN_MINUS_ONE]
-    least = max(_MIN_DISPLAYED_STIFFNESS, base) * min(gain, 1.0)
-    return max(least, min(gain * base, _MAX_DISPLAYED_STIFFNESS))
+    least = max(_MIN_STIFFNESS_AT_HAND, base) * min(gain, 1.0)
+    return max(least, min(gain * base, _MAX_STIFFNESS_AT_HAND))
 
 
 @njit(cache=True)
@@ -251,7 +252,7 @@ def _update_contact_fit_and_rendered_force(received, in_contact, dx, wrench, T, 
         memory[IN_CONTACT_FLAG] = memory[_FILTERED_FORCE] = memory[_MAX_FRICTION_FORCE] = 0.0
         return
     size = update_contact_direction(wrench, memory[_LONGEST_ROUND_TRIP], T, p, memory)
-    k_d = _update_max_displayed_stiffness(received, T, p, memory)
+    k_d = _update_max_stiffness_at_hand(received, T, p, memory)
     max_change = _estimate_max_force_change_by_slip(wrench, size, T, p, memory)
     inward, rate = -work_along(normal, dx), min(T / _SLAVE_MEASUREMENT_FILTER_S, 1.0)
     speed = -work_along(normal, velocity)
@@ -267,7 +268,7 @@ def _update_contact_fit_and_rendered_force(received, in_contact, dx, wrench, T, 
     memory[_FIT_SAMPLE_LENGTH] += filtered_step
     memory[_FILTERED_FORCE] += rate * (size - memory[_FILTERED_FORCE])
     tip_speed = length_of_group(velocity, 1) / ANGLE_PER_LENGTH[1]
-    slow = math.hypot(length_of_group(velocity, 0), tip_speed) < _MIN_SPEED_FOR_FAST_FIT_M_PER_S
+    slow = math.hypot(length_of_group(velocity, 0), tip_speed) < _FASTER_FORGETTING_SPEED_M_PER_S
     length_m = abs(memory[_FIT_SAMPLE_LENGTH])
     if length_m > (_MIN_FIT_SAMPLE_LENGTH_M if slow else _MIN_FAST_FIT_SAMPLE_LENGTH_M):
         memory[_FIT_SPAN] = min(memory[_FIT_SPAN] + length_m, _MAX_FIT_SPAN_M)
@@ -275,10 +276,10 @@ def _update_contact_fit_and_rendered_force(received, in_contact, dx, wrench, T, 
         speed_change = speed - memory[_SAMPLE_START_SPEED]
         stretch, damping = memory[_FIT_SAMPLE_LENGTH], memory[_CONTACT_DAMPING]
         change = memory[_FILTERED_FORCE] - memory[_SAMPLE_START_FORCE] - damping * speed_change
-        largest = max(2.0 * k, _MIN_DISPLAYED_STIFFNESS) * stretch
+        largest = max(2.0 * k, _MIN_STIFFNESS_AT_HAND) * stretch
         change -= contact_fit.force_change_by_slip(change, largest, max_change)
         change += damping * speed_change
-        k, damping = update_contact_fit(memory[_FIT_SUMS], change, stretch, speed_change, keep)
+        k, damping = update_contact_fit(memory[_FIT_SUM_SLICE], change, stretch, speed_change, keep)
         memory[_CONTACT_STIFFNESS], memory[_CONTACT_DAMPING] = k, damping
         memory[_FIT_SAMPLE_LENGTH], memory[_SAMPLE_START_FORCE] = 0.0, memory[_FILTERED_FORCE]
         memory[_SAMPLE_START_SPEED] = speed
@@ -306,7 +307,7 @@ def _is_wall_removed(dx, memory):
     speed_change = work_along(normal, memory[FILTERED_OWN_VELOCITY]) + memory[_LAST_SPEED_INTO_WALL]
     explained = abs(memory[_CONTACT_STIFFNESS] * work_along(normal, dx))
     explained += abs(memory[_CONTACT_DAMPING] * speed_change)
-    return memory[_RENDERED_FORCE] > max(_MIN_LOST_FORCE_OF_REMOVED_WALL_N, 2.0 * explained)
+    return memory[_RENDERED_FORCE] > max(_MIN_FORCE_DROP_AT_WALL_REMOVAL_N, 2.0 * explained)
 
 
 @njit(cache=True)
@@ -325,13 +326,13 @@ def _update_command_velocity(received, connected, T, p, memory, error):
     normal, compliance, beyond_wall, inward_speed = memory[CONTACT_DIRECTION], 0.0, 0.0, 0.0
     if memory[IN_CONTACT_FLAG] > 0.0:
         beyond_wall = memory[_SLAVE_WALL_DEPTH] - work_along(normal, error)
-        beyond_wall -= work_along(normal, memory[_MOTOR_WRENCH])
+        beyond_wall -= work_along(normal, memory[_MOTOR_WRENCH_SLICE])
         if beyond_wall > 0.0:
             compliance, inward_speed = 1.0 - memory[_STIFFNESS_SHARE], -work_along(normal, feed)
     feeds_forward = connected and memory[_SILENCE_TIME] < _MAX_SILENCE_WITH_FEEDFORWARD_S
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
-            error[i] += compliance * beyond_wall * p[WRENCH_METRIC][g] * normal[i]
+            error[i] += compliance * beyond_wall * p[NORM_WEIGHTS_SLICE][g] * normal[i]
         acceleration = _MAX_COMMAND_ACCELERATION * ANGLE_PER_LENGTH[g]
         distance, rate = length_of_group(error, g), 1.0 / _COMMAND_FILTER_S
         if distance > 0.0:
@@ -339,7 +340,8 @@ def _update_command_velocity(received, connected, T, p, memory, error):
         for i in range(3 * g, 3 * g + 3):
             error[i] *= rate
             if feeds_forward:
-                error[i] += feed[i] + compliance * inward_speed * p[WRENCH_METRIC][g] * normal[i]
+                push = compliance * inward_speed * p[NORM_WEIGHTS_SLICE][g]
+                error[i] += feed[i] + push * normal[i]
         unused, mass = UNUSED_SLAVE_RESERVE_SHARE * p[SLAVE_RESERVE][g], p[slots.SLAVE_MASS][g]
         available = max(memory[slots.STORED_ENERGY][g] - unused, 0.0)
         fields.limit_group(error, g, math.sqrt(2.0 * available / (SLAVE_MASS_FACTOR * mass)))
@@ -353,7 +355,7 @@ def _update_command_velocity(received, connected, T, p, memory, error):
 @njit(cache=True)
 def _limit_command_to_motor_energy(command, pose, twist, p, memory):
     """Move the command (7,) towards `pose` until the motor energy suffices; return if it moved."""
-    motor_wrench, changed = memory[_MOTOR_WRENCH], False
+    motor_wrench, changed = memory[_MOTOR_WRENCH_SLICE], False
     fields.pose_difference_into(command, pose, motor_wrench)
     for g in range(2):
         K = _SERVO_STIFFNESS_FACTOR * p[slots.SERVO_K][g]
@@ -376,7 +378,7 @@ def _limit_command_to_motor_energy(command, pose, twist, p, memory):
 
 @njit(cache=True)
 def _limit_group_motor_wrench_to_energy(g, damping, twist, p, memory):
-    motor_wrench, velocity = memory[_MOTOR_WRENCH], memory[FILTERED_OWN_VELOCITY]
+    motor_wrench, velocity = memory[_MOTOR_WRENCH_SLICE], memory[FILTERED_OWN_VELOCITY]
     contact = memory[_CONTACT_WRENCH]
     size, speed = length_of_group(motor_wrench, g), length_of_group(twist, g)
     mass = SLAVE_MASS_FACTOR * p[slots.SLAVE_MASS][g]

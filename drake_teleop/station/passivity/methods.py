@@ -44,7 +44,7 @@ from drake_teleop.station.passivity.wave import WaveConfig
 
 
 @njit(cache=True)
-def _ignore_command_change(requested, command, pose, twist, p, memory):
+def _keep_memory_at_command_change(requested, command, pose, twist, p, memory):
     pass
 
 
@@ -64,7 +64,7 @@ class PassivityMethod(NamedTuple):
 
     master_step: Any
     slave_step: Any
-    record_command: Any = _ignore_command_change
+    record_command: Any = _keep_memory_at_command_change
     initialize: Callable[[Array, Array], None] | None = None
     config: type[Any] | None = None
     balance_at_motors: bool = False
@@ -73,7 +73,7 @@ class PassivityMethod(NamedTuple):
     speed_limit: Callable[[Any, Array], Array] | None = None
 
 
-def _method_functions(module: Any) -> tuple[Any, Any, Any, Any]:
+def _functions_of_module(module: Any) -> tuple[Any, Any, Any, Any]:
     return module.master_step, module.slave_step, module.record_command, module.initialize
 
 
@@ -85,8 +85,8 @@ METHODS = Registry(
         "wave": PassivityMethod(wave.master_step, wave.slave_step),
         "tdpa": _TDPA_METHOD,
         "charged_tdpa": _TDPA_METHOD,
-        "two_layer": PassivityMethod(*_method_functions(two_layer), balance_at_motors=True),
-        "pspm": PassivityMethod(*_method_functions(pspm), balance_at_motors=True),
+        "two_layer": PassivityMethod(*_functions_of_module(two_layer), balance_at_motors=True),
+        "pspm": PassivityMethod(*_functions_of_module(pspm), balance_at_motors=True),
         "ledger": PassivityMethod(
             ledger.master_step,
             ledger_slave.slave_step,
@@ -113,7 +113,7 @@ class PassivityConfig:
     """Method that keeps the station passive, and the parameters of each method.
 
     The servo's force on the slave is K (x_command - x) - D v. `charged_tdpa`, `two_layer`, `pspm`,
-    `ledger` and `four_channel` use K and D. `two_layer`, `ledger` and `retreat` use the mass.
+    `ledger` and `four_channel` use K, D; `two_layer`, `ledger` and limit `retreat` use the mass.
     """
 
     method: str = choice(
@@ -125,7 +125,7 @@ class PassivityConfig:
     torque_limit: float = quantity(0.17, "N m", 0.0, 1e3, "largest rendered torque at the hand")
     retreat: list[float] = quantity(
         [0.1, 1.0], "m/s, rad/s", 1e-3, 1e3,
-        "hand speed along the wrench from which the wrench fades, to zero at twice the speed",
+        "hand speed along the wrench above which the wrench fades, to 0 at twice this speed",
     )  # fmt: skip
     servo_stiffness: list[float] = quantity(
         [2.1e5, 6.8e3], "N/m, N m/rad", 1.0, 1e9, "K of the slave's servo, in its units (estimate)"
@@ -139,7 +139,7 @@ class PassivityConfig:
         "mass of arm and tool at the tool, in the slave's units; null: with ledger, mass and servo"
         " of the station's arm at the start; else 15.13, 0.5 (estimate)", length=2,
     )  # fmt: skip
-    registered: dict[str, float] = plain({}, "parameters of a registered method, by name")
+    registered: dict[str, float] = plain({}, "parameters of a custom method: name and value")
     wave: WaveConfig = field(default_factory=WaveConfig)
     tdpa: TdpaConfig = field(default_factory=TdpaConfig)
     charged_tdpa: TdpaConfig = field(default_factory=charged_tdpa_config)
@@ -215,27 +215,27 @@ def initial_method_memory(method: str, parameters: Array, pose: Array) -> Array:
     return memory
 
 
-_VECTOR_TYPE = types.Array(types.float64, 1, "C")
-_STEP_ARGUMENT_TYPES = (
-    (_VECTOR_TYPE, types.boolean, *[_VECTOR_TYPE] * 5, types.float64, *[_VECTOR_TYPE] * 4),
-    (_VECTOR_TYPE, types.boolean, *[_VECTOR_TYPE] * 4, types.float64, *[_VECTOR_TYPE] * 4),
-    (_VECTOR_TYPE,) * 6,
+_NUMBA_VECTOR = types.Array(types.float64, 1, "C")
+_NUMBA_STEP_ARGUMENT_TYPES = (
+    (_NUMBA_VECTOR, types.boolean, *[_NUMBA_VECTOR] * 5, types.float64, *[_NUMBA_VECTOR] * 4),
+    (_NUMBA_VECTOR, types.boolean, *[_NUMBA_VECTOR] * 4, types.float64, *[_NUMBA_VECTOR] * 4),
+    (_NUMBA_VECTOR,) * 6,
 )
-_call_master, _call_slave, _call_record = map(make_call_at_address, _STEP_ARGUMENT_TYPES)
+_call_master, _call_slave, _call_record = map(make_call_at_address, _NUMBA_STEP_ARGUMENT_TYPES)
 
 
 def step_addresses(method: str) -> tuple[int, ...]:
     """Return the addresses of `master_step`, `slave_step` and `record_command` of a method."""
-    return _addresses_of_compiled_steps(*METHODS[method][:3])
+    return _memory_addresses_of_functions(*METHODS[method][:3])
 
 
 @cache
-def _addresses_of_compiled_steps(*steps: Any) -> tuple[int, ...]:
-    return tuple(map(address_of_function, steps, _STEP_ARGUMENT_TYPES))
+def _memory_addresses_of_functions(*steps: Any) -> tuple[int, ...]:
+    return tuple(map(address_of_function, steps, _NUMBA_STEP_ARGUMENT_TYPES))
 
 
 @njit(cache=True)
-def _number_packet_or_repeat_last_healthy(healthy, memory, packet):
+def _finish_packet_or_repeat_last_healthy(healthy, memory, packet):
     if healthy:
         packet[fields.SENDER_INPUTS_FINITE] = 1.0
         copy_into(memory, slots.LAST_HEALTHY_SENT_PACKET.start, packet, 0, fields.PACKET_SIZE)
@@ -275,7 +275,7 @@ def master_step(
             steps[0], received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
         )
         fade_retreat_wrench(twist, T, p, memory, wrench)
-    _number_packet_or_repeat_last_healthy(healthy, memory, packet)
+    _finish_packet_or_repeat_last_healthy(healthy, memory, packet)
 
 
 @njit(cache=True)
@@ -299,14 +299,14 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
         _call_slave(
             steps[1], received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
         )
-    _number_packet_or_repeat_last_healthy(healthy, memory, packet)
+    _finish_packet_or_repeat_last_healthy(healthy, memory, packet)
 
 
 @njit(cache=True)
 def record_command(steps, requested, command, pose, twist, p, memory):
     """Update the method's memory if the safe state changed the method's command.
 
-    `requested` (7,) is the method's command X_WS, `command` (7,) that of the safe state, which
-    `ledger` may change. Other arguments: see `slave_step`.
+    `requested` (7,) is the method's command X_WS, `command` (7,) that of the safe state; `ledger`
+    may change `command`. Other arguments: see `slave_step`.
     """
     _call_record(steps[2], requested, command, pose, twist, p, memory)

@@ -13,23 +13,23 @@ from drake_teleop.common.vectors import normalized_quaternion, quaternion_produc
 from drake_teleop.station.passivity.memory import RECEIVED_ENERGY, SlotAllocator
 
 PACKET_SIZE = 38
-_layout = SlotAllocator(PACKET_SIZE)
-PACKET_NUMBER = _layout.number()  #: number of the packet, counted by its sender
+_packet_slots = SlotAllocator(PACKET_SIZE)
+PACKET_NUMBER = _packet_slots.number()  #: number of the packet, counted by its sender
 #: 1 if the sender's inputs were finite; else 0, with the contents of its last good packet.
-SENDER_INPUTS_FINITE = _layout.number()
-POSE = _layout.vector(7)  #: X_WS [qw qx qy qz px py pz] of the sender
-VELOCITY = _layout.vector(6)  #: twist of the sender [v; omega], in W
-WRENCH = _layout.vector(6)  #: wrench at the sender [f; tau], in W, in the master's power units
-METHOD_VALUES = _layout.vector(6)  #: values that the method defines, such as a wave integral
-CUMULATIVE_ENERGY = _layout.vector(2)  #: cumulative energy that the receiver may use, by group [J]
-SENDER_ENERGY = _layout.vector(2)  #: energy stored at the sender, by group [J]
-CONTACT_FLAG = _layout.number()  #: 1 while the slave's detector reports contact
+SENDER_INPUTS_FINITE = _packet_slots.number()
+POSE = _packet_slots.vector(7)  #: X_WS [qw qx qy qz px py pz] of the sender
+VELOCITY = _packet_slots.vector(6)  #: twist of the sender [v; omega], in W
+WRENCH = _packet_slots.vector(6)  #: wrench at the sender [f; tau], in W, master's power units
+METHOD_VALUES = _packet_slots.vector(6)  #: values that the method defines, such as a wave integral
+CUMULATIVE_ENERGY = _packet_slots.vector(2)  #: energy ever sent to the receiver, by group [J]
+SENDER_ENERGY = _packet_slots.vector(2)  #: energy stored at the sender, by group [J]
+CONTACT_FLAG = _packet_slots.number()  #: 1 while the slave's detector reports contact
 #: Part of the slave's wrench from weight and inertia of its load, as `WRENCH`. It is the last
 #: field, because only `ledger` uses it; with other methods it is not transmitted.
-PACKET_LOAD_WRENCH = _layout.vector(6)
+PACKET_LOAD_WRENCH = _packet_slots.vector(6)
 
 #: Largest rate of force and torque at the hand that is not perceived as an impact [N/s, N m/s].
-MAX_HAND_WRENCH_RATE = (450.0, 4.5)
+MAX_HAND_WRENCH_RATES = (450.0, 4.5)
 
 
 @njit(cache=True)
@@ -103,7 +103,7 @@ def pose_difference_into(pose, reference, difference):
 
 @njit(cache=True)
 def move_pose_into(pose, displacement, out):
-    """Write the pose moved by a displacement (6,) e, [exp(e_r) R; p + e_p], into `out` (7,)."""
+    """Write `pose` (7,), moved by a displacement (6,) [translation; rotation vector], to `out`."""
     turn = vectors.quaternion_exponential((displacement[3], displacement[4], displacement[5]))
     q = normalized_quaternion(quaternion_product(turn, (pose[0], pose[1], pose[2], pose[3])))
     out[0], out[1], out[2], out[3] = q

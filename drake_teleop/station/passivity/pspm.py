@@ -18,12 +18,12 @@ from drake_teleop.station.passivity import packet as fields
 from drake_teleop.station.passivity.packet import dot_of_group, fill_packet, pose_difference_into
 
 # Parameters, for translation and rotation.
-_layout = slots.own_parameters()
-_INITIAL_ENERGY, _MAX_STORED_ENERGY = _layout.vector(2), _layout.vector(2)
-_SPRING_STIFFNESS, _HAND_DAMPING = _layout.vector(2), _layout.vector(2)
+_parameter_slots = slots.own_parameters()
+_INITIAL_ENERGY, _MAX_STORED_ENERGY = map(_parameter_slots.vector, (2, 2))
+_SPRING_STIFFNESS, _HAND_DAMPING = map(_parameter_slots.vector, (2, 2))
 # Memory: set position minus actual position; requested value of this difference.
-_layout = slots.own_memory()
-_SPRING_DEFLECTION, _REQUESTED_SPRING_DEFLECTION = _layout.vector(6), _layout.vector(6)
+_memory_slots = slots.own_memory()
+_SPRING_DEFLECTION, _REQUESTED_SPRING_DEFLECTION = map(_memory_slots.vector, (6, 6))
 
 
 @settings
@@ -31,10 +31,10 @@ _SPRING_DEFLECTION, _REQUESTED_SPRING_DEFLECTION = _layout.vector(6), _layout.ve
 class PspmConfig:
     """Parameters of the passive set-position modulation."""
 
-    initial: list[float] = quantity([0.01, 2e-4], "J", 0.0, 1e3, "energy E of an end at the start")
+    initial: list[float] = quantity([0.01, 2e-4], "J", 0.0, 1e3, "stored energy at the start")
     ceiling: list[float] = quantity(
         [0.015, 3e-4], "J", 0.0, 1e6,
-        "largest E; the master sends any excess to the slave, the slave discards it",
+        "largest stored energy of an end; the master sends any excess, the slave discards it",
     )  # fmt: skip
     stiffness: list[float] = quantity(
         [1000.0, 10.0], "N/m, N m/rad", 1e-6, 1e9, "K_h, spring between set position and hand"
@@ -54,11 +54,11 @@ def initialize(p, memory):
 
 
 @njit(cache=True)
-def _modulate_set_position(received, g, stiffness, dx, square_before, is_master, p, memory, packet):
+def _modulate_set_position(received, g, stiffness, dx, last_square, is_master, p, memory, packet):
     offset, requested = memory[_SPRING_DEFLECTION], memory[_REQUESTED_SPRING_DEFLECTION]
     stored, required = dot_of_group(offset, offset, g), dot_of_group(requested, requested, g)
     damped = -dot_of_group(memory[slots.LAST_PORT_WRENCH], dx, g)
-    damped -= 0.5 * stiffness * (stored - square_before)
+    damped -= 0.5 * stiffness * (stored - last_square)
     ledger = memory[slots.STORED_ENERGY]
     energy = ledger[g] + damped
     energy += fields.count_newly_received_energy(g, received, memory)

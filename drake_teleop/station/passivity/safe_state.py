@@ -1,7 +1,7 @@
 """Safe state of both ends of the channel for silence and faulty data; docs/delay.md.
 
 A sender is *healthy* while its inputs are finite and at most 1e6 in SI units. An end is *silent* if
-no new packet of a healthy sender came for `timeout` seconds, and at once if an end is not healthy.
+no new packet of a healthy sender came for `timeout` seconds, and at once if either is not healthy.
 """
 
 from __future__ import annotations
@@ -21,40 +21,39 @@ RESUME_TIME_S = 0.5  #: time of the transition to normal operation [s]
 _HAND_VELOCITY_FILTER_S = 4e-3  # of the velocity: encoders have steps
 MASTER_MONITOR_SIZE, SLAVE_MONITOR_SIZE = 6, 30  #: lengths of the monitor states
 # Monitor state of the master.
-_layout = slots.SlotAllocator(MASTER_MONITOR_SIZE)
-SILENCE_TIME_INDEX = _layout.number()  #: time without packets [s], also at the slave
-_PRESENT_HAND_WRENCH_LIMITS = _layout.vector(2)  # present limits
-_WRENCH_LIMIT_FALL_RATE = _layout.vector(2)  # their decrease per second
-_CONNECTED_TIME = _layout.number()  # time since the last silence
+_master_monitor_slots = slots.SlotAllocator(MASTER_MONITOR_SIZE)
+SILENCE_TIME_INDEX = _master_monitor_slots.number()  #: time without packets [s], also at the slave
+_WRENCH_LIMITS_SLICE = _master_monitor_slots.vector(2)  # present limits
+_LIMIT_FALL_RATES_SLICE = _master_monitor_slots.vector(2)  # their decrease per second
+_CONNECTED_TIME = _master_monitor_slots.number()  # time since the last silence
 # Monitor state of the slave.
-_layout = slots.SlotAllocator(SLAVE_MONITOR_SIZE, SILENCE_TIME_INDEX + 1)
-_TIME_SINCE_STOP_BEGAN = _layout.number()  # time since it began to stop
-_TIME_SINCE_RESUME_BEGAN = _layout.number()  # time since it began to resume
-_COMMAND_POSE_AT_STOP = _layout.vector(7)  # command when it began to stop
-_COMMAND_VELOCITY_AT_STOP_START = _layout.vector(6)  # its velocity
-_LAST_COMMAND, _COMMAND_BEFORE_LAST = _layout.vector(7), _layout.vector(7)
+_slave_monitor_slots = slots.SlotAllocator(SLAVE_MONITOR_SIZE, SILENCE_TIME_INDEX + 1)
+_STOPPING_TIME_INDEX = _slave_monitor_slots.number()  # time since it began to stop
+_RESUMING_TIME_INDEX = _slave_monitor_slots.number()  # time since it began to resume
+_STOP_POSE_SLICE = _slave_monitor_slots.vector(7)  # command when it began to stop
+_STOP_VELOCITY_SLICE = _slave_monitor_slots.vector(6)  # its velocity
+_LAST_COMMAND_SLICE, _EARLIER_COMMAND_SLICE = map(_slave_monitor_slots.vector, (7, 7))
 
 
 def initial_master_monitor(device_limits: Array | None = None) -> Array:
-    """Return the silence monitor's state (MASTER_MONITOR_SIZE,) of a silent master.
+    """Return the silence monitor's state (6,) of a master that has received no packet.
 
-    With `device_limits` (2,), the device's largest force and torque [N, N m], return the state in
-    normal operation instead.
+    With `device_limits` (2,), the largest force and torque [N, N m]: state in normal operation.
     """
     state = np.zeros(MASTER_MONITOR_SIZE)
     if device_limits is None:
         state[SILENCE_TIME_INDEX] = np.inf
     else:
-        state[_PRESENT_HAND_WRENCH_LIMITS] = device_limits
+        state[_WRENCH_LIMITS_SLICE] = device_limits
         state[_CONNECTED_TIME] = RESUME_TIME_S
     return state
 
 
 def initial_slave_monitor(pose: Array) -> Array:
-    """Return the silence monitor's state (SLAVE_MONITOR_SIZE,) of a slave at rest at `pose`."""
+    """Return the silence monitor's state (30,) of a slave at rest at `pose`."""
     state = np.zeros(SLAVE_MONITOR_SIZE)
     state[SILENCE_TIME_INDEX] = np.inf
-    state[_COMMAND_POSE_AT_STOP] = state[_LAST_COMMAND] = state[_COMMAND_BEFORE_LAST] = pose
+    state[_STOP_POSE_SLICE] = state[_LAST_COMMAND_SLICE] = state[_EARLIER_COMMAND_SLICE] = pose
     return state
 
 
@@ -76,7 +75,7 @@ def master_wrench_limits_into(healthy, fault, T, timeout, device_limits, display
     _update_silence_time(healthy, fault, T, state)
     connected = state[SILENCE_TIME_INDEX] <= timeout
     state[_CONNECTED_TIME] = min(state[_CONNECTED_TIME] + T, RESUME_TIME_S) if connected else 0.0
-    present, fall = state[_PRESENT_HAND_WRENCH_LIMITS], state[_WRENCH_LIMIT_FALL_RATE]
+    present, fall = state[_WRENCH_LIMITS_SLICE], state[_LIMIT_FALL_RATES_SLICE]
     for g in range(2):
         size, limit = length_of_group(displayed, g), present[g]
         if connected:
@@ -95,32 +94,31 @@ def master_wrench_limits_into(healthy, fault, T, timeout, device_limits, display
 def slave_command_into(healthy, fault, T, timeout, requested, state, command):
     """Write the slave's command X_WS (7,): `requested`, or during silence a braking motion.
 
-    `requested` (7,) is the passivity method's command. Other arguments are those of
-    `master_wrench_limits_into`.
+    `requested` (7,) is the method's command; for others see `master_wrench_limits_into`.
     """
     _update_silence_time(healthy, fault, T, state)
-    last, before = state[_LAST_COMMAND], state[_COMMAND_BEFORE_LAST]
-    start, velocity = state[_COMMAND_POSE_AT_STOP], state[_COMMAND_VELOCITY_AT_STOP_START]
+    last, before = state[_LAST_COMMAND_SLICE], state[_EARLIER_COMMAND_SLICE]
+    start, velocity = state[_STOP_POSE_SLICE], state[_STOP_VELOCITY_SLICE]
     step = np.empty(6)
     if state[SILENCE_TIME_INDEX] <= timeout:
-        state[_TIME_SINCE_RESUME_BEGAN] = min(state[_TIME_SINCE_RESUME_BEGAN] + T, RESUME_TIME_S)
-    elif state[_TIME_SINCE_RESUME_BEGAN] > 0.0:
+        state[_RESUMING_TIME_INDEX] = min(state[_RESUMING_TIME_INDEX] + T, RESUME_TIME_S)
+    elif state[_RESUMING_TIME_INDEX] > 0.0:
         fields.pose_difference_into(last, before, velocity)
         for i in range(6):
             velocity[i] /= T
         copy_into(start, 0, last, 0, 7)
-        state[_TIME_SINCE_STOP_BEGAN] = state[_TIME_SINCE_RESUME_BEGAN] = 0.0
-    if state[_TIME_SINCE_RESUME_BEGAN] == RESUME_TIME_S:
+        state[_STOPPING_TIME_INDEX] = state[_RESUMING_TIME_INDEX] = 0.0
+    if state[_RESUMING_TIME_INDEX] == RESUME_TIME_S:
         copy_into(command, 0, requested, 0, 7)
     else:
         # A blend from the stopping motion to the requested command keeps the velocity continuous
         # even if the end resumes before it has stopped.
-        state[_TIME_SINCE_STOP_BEGAN] += T
-        u = min(state[_TIME_SINCE_STOP_BEGAN] / STOP_TIME_S, 1.0)
+        state[_STOPPING_TIME_INDEX] += T
+        u = min(state[_STOPPING_TIME_INDEX] / STOP_TIME_S, 1.0)
         for i in range(6):  # velocity falls as 1 - 3 u^2 + 2 u^3
             step[i] = velocity[i] * STOP_TIME_S * u * (1.0 - u * u * (1.0 - 0.5 * u))
         move_pose_into(start, step, command)
-        u = state[_TIME_SINCE_RESUME_BEGAN] / RESUME_TIME_S
+        u = state[_RESUMING_TIME_INDEX] / RESUME_TIME_S
         if u > 0.0:
             fields.pose_difference_into(requested, command, step)
             for i in range(6):
@@ -134,8 +132,8 @@ def slave_command_into(healthy, fault, T, timeout, requested, state, command):
 def fade_retreat_wrench(twist, T, p, memory, wrench):
     """Reduce a wrench (6,) that pushes the hand, so that a released stylus stays slow.
 
-    Force and torque fall to 0 for hand speeds along them from `FORCE_FADE_HAND_SPEED` to twice
-    this, but not below `SLAVE_MASS` times the hand's deceleration. `memory` stores the new wrench.
+    Force and torque fall to 0 at twice the permitted hand speed (parameter `retreat`), but not
+    below the slave's mass times the hand's deceleration. `memory` stores the new wrench.
     """
     velocity, rate = memory[slots.FILTERED_HAND_VELOCITY], min(T / _HAND_VELOCITY_FILTER_S, 1.0)
     for i in range(6):

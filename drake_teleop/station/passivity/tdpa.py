@@ -18,11 +18,11 @@ from drake_teleop.station.passivity import packet as fields
 from drake_teleop.station.passivity.packet import dot_of_group, length_of_group, limit_group
 
 # Share of the hand's input kept until the reserve is full; all of it would starve a soft wall.
-_KEPT_HAND_ENERGY_SHARE = 0.5
+_UNSENT_HAND_ENERGY_SHARE = 0.5
 # Onset and end of a wrench that needs no delay filter: slower than hand and servo [s].
-_WRENCH_ONSET_FILTER_S = 0.1
-_MAX_ENDED_OVER_FILTERED_WRENCH = 0.1  # a wrench below this share of the filtered one ends
-_MIN_COMPLETE_ONSET_SHARE = 0.98  # share at which a quick onset is complete
+_WRENCH_ONSET_TIME_CONSTANT_S = 0.1
+_CONTACT_END_WRENCH_RATIO = 0.1  # a wrench below this share of the filtered one ends
+_WRENCH_SHARE_AT_ONSET_END = 0.98  # share at which a quick onset is complete
 # Travel over which the contact stiffness is averaged [m, rad], and speed below which the drag fades
 # [m/s, rad/s], for translation and rotation.
 _STIFFNESS_AVERAGING_TRAVEL_M_RAD = (1e-3, 1e-2)
@@ -33,21 +33,21 @@ _NEWEST_MASTER_PACKET_NUMBER = fields.METHOD_VALUES.start
 _PACKET_SLAVE_ENERGY = fields.SENDER_ENERGY
 
 # Parameters; reserve, drag and stiffness in the master's power units.
-_layout = slots.own_parameters()
-_WRENCH_RELEASE_TIME, _LEDGER_DRAIN_RATE, _COMMAND_DRIFT_RATE = (_layout.number() for _ in range(3))
-_TARGET_RESERVE, _DRAG_WRENCH, _HAND_STIFFNESS = (_layout.vector(2) for _ in range(3))
-_MAX_COMMAND_SPEED = _layout.vector(2)
+_parameter_slots = slots.own_parameters()
+_WRENCH_RELEASE_TIME, _LEDGER_DRAIN_RATE, _COMMAND_DRIFT_RATE = _parameter_slots.numbers(3)
+_TARGET_RESERVE, _DRAG_WRENCH, _HAND_STIFFNESS = map(_parameter_slots.vector, [2] * 3)
+_MAX_COMMAND_SPEED = _parameter_slots.vector(2)
 # Memory of the master: withheld share of the wrench, kept energy.
-_layout = slots.own_memory()
-_WITHHELD_WRENCH_SHARE, _MASTER_RESERVED_ENERGY = _layout.vector(2), _layout.vector(2)
+_master_memory_slots = slots.own_memory()
+_WITHHELD_WRENCH_SHARE, _MASTER_RESERVED_ENERGY = map(_master_memory_slots.vector, (2, 2))
 # Memory of the slave: work in and out at the actual and the commanded motion; withheld motion;
 # filtered wrench; contact stiffness; number of the packet that completed a quick onset.
-_layout = slots.own_memory()
-_SLAVE_WORK_IN, _SLAVE_WORK_OUT = _layout.vector(2), _layout.vector(2)
-_COMMAND_WORK_IN, _COMMAND_WORK_OUT = _layout.vector(2), _layout.vector(2)
-_WITHHELD_COMMAND_MOTION, _FILTERED_SLAVE_WRENCH = _layout.vector(6), _layout.vector(6)
-_CONTACT_STIFFNESS_ESTIMATE, _QUICK_ONSET_PACKET_NUMBER = _layout.vector(2), _layout.vector(2)
-_LAST_COMMAND_POSE = _layout.vector(7)  # the command of the last step
+_slave_memory_slots = slots.own_memory()
+_SLAVE_WORK_IN, _SLAVE_WORK_OUT = map(_slave_memory_slots.vector, (2, 2))
+_COMMAND_WORK_IN, _COMMAND_WORK_OUT = map(_slave_memory_slots.vector, (2, 2))
+_WITHHELD_COMMAND_MOTION, _FILTERED_SLAVE_WRENCH = map(_slave_memory_slots.vector, (6, 6))
+_CONTACT_STIFFNESS_ESTIMATE, _QUICK_ONSET_PACKET_NUMBER = map(_slave_memory_slots.vector, (2, 2))
+_LAST_COMMAND_POSE = _slave_memory_slots.vector(7)  # the command of the last step
 
 
 @settings
@@ -64,17 +64,17 @@ class TdpaConfig:
     )
     drift_rate: float = quantity(
         20.0, "1/s", 0.0, 1e3,
-        "rate of the return to the received command, within the available energy",
+        "rate at which the command returns to the received one, within the available energy",
     )  # fmt: skip
     speed: list[float] = quantity(
         [1.0, 10.0], "m/s, rad/s", 1e-3, 1e3,
-        "largest speed of the slave's command; an impact may create its kinetic energy",
+        "largest speed of the slave's command; bounds the energy that an impact may create",
     )  # fmt: skip
     reserve: list[float] = quantity(
-        [2e-3, 1e-4], "J", 0.0, 1e3, "energy from the hand that the master keeps"
+        [2e-3, 1e-4], "J", 0.0, 1e3, "energy of the hand's work that the master keeps"
     )
     drag: list[float] = quantity(
-        [0.0, 0.0], "N, N m", 0.0, 10.0, "drag on the hand while an end has less than the reserve"
+        [0.0, 0.0], "N, N m", 0.0, 10.0, "drag on the hand while an end has less than `reserve`"
     )
     hand_stiffness: list[float] = quantity(
         [0.0, 0.0], "N/m, N m/rad", 0.0, 1e5,
@@ -109,7 +109,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         work_on_hand = dot_of_group(wrench, dx, g)
         stored = ledger[g] + kept[g]
         if share * work_on_hand > drain * stored:
-            max_decrease = fields.MAX_HAND_WRENCH_RATE[g] * T / p[slots.SLAVE_PER_MASTER_MOTION][g]
+            max_decrease = fields.MAX_HAND_WRENCH_RATES[g] * T / p[slots.SLAVE_PER_MASTER_MOTION][g]
             least = length_of_group(memory[slots.LAST_PORT_WRENCH], g) - max_decrease
             by_rates = max(drain * stored / work_on_hand, least / length_of_group(wrench, g))
             share = min(share, by_rates, stored / work_on_hand)
@@ -117,7 +117,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         memory[slots.DISSIPATED_ENERGY][g] += (1.0 - share) * work_on_hand
         fields.scale_group(wrench, g, share)
         _add_hand_drag(g, received[_PACKET_SLAVE_ENERGY][g], dx, limits, T, p, memory, wrench)
-        _update_ledger_by_hand_work_of_group(g, dot_of_group(wrench, dx, g), p, memory)
+        _subtract_hand_work_of_group(g, dot_of_group(wrench, dx, g), p, memory)
         if p[_DRAG_WRENCH][g] > 0.0:
             surplus = min(max(ledger[g] + kept[g] - p[_TARGET_RESERVE][g], 0.0), ledger[g])
             ledger[g] -= surplus
@@ -139,14 +139,14 @@ def _add_hand_drag(g, slave_ledger, dx, limits, T, p, memory, wrench):
 
 
 @njit(cache=True)
-def _update_ledger_by_hand_work_of_group(g, work_on_hand, p, memory):
+def _subtract_hand_work_of_group(g, work_on_hand, p, memory):
     ledger, kept = memory[slots.STORED_ENERGY], memory[_MASTER_RESERVED_ENERGY]
     if work_on_hand > 0.0:
         more = min(ledger[g] - work_on_hand, 0.0)
         ledger[g] = max(ledger[g] - work_on_hand, 0.0)
     else:
         missing = max(p[_TARGET_RESERVE][g] - kept[g], 0.0)
-        more = min(-_KEPT_HAND_ENERGY_SHARE * work_on_hand, missing)
+        more = min(-_UNSENT_HAND_ENERGY_SHARE * work_on_hand, missing)
         memory[slots.SENT_ENERGY][g] -= work_on_hand + more
     kept[g] = max(kept[g] + more, 0.0)
 
@@ -185,16 +185,16 @@ def _filter_returned_wrench_of_group(g, received, dx, wrench, T, p, memory):
         round_trip = max(memory[slots.STEP_COUNT] - received[_NEWEST_MASTER_PACKET_NUMBER], 1.0) * T
         lag = round_trip + p[slots.SERVO_D][g] / p[slots.SERVO_K][g]
         size, filtered_size = length_of_group(wrench, g), length_of_group(filtered, g)
-        onset_rate = min(T / _WRENCH_ONSET_FILTER_S, 1.0)
+        onset_rate = min(T / _WRENCH_ONSET_TIME_CONSTANT_S, 1.0)
         rate = min(T / (lag * (1.0 + math.e * gain)), 1.0)
-        if size < _MAX_ENDED_OVER_FILTERED_WRENCH * filtered_size:
+        if size < _CONTACT_END_WRENCH_RATIO * filtered_size:
             rate = max(rate, onset_rate)
         else:
-            if filtered_size * (1.0 + gain) < _MIN_COMPLETE_ONSET_SHARE * size:
+            if filtered_size * (1.0 + gain) < _WRENCH_SHARE_AT_ONSET_END * size:
                 onset = onset_rate
                 memory[_QUICK_ONSET_PACKET_NUMBER][g] = memory[slots.STEP_COUNT]
             awaited = received[_NEWEST_MASTER_PACKET_NUMBER] < memory[_QUICK_ONSET_PACKET_NUMBER][g]
-            if lag > _WRENCH_ONSET_FILTER_S and awaited:
+            if lag > _WRENCH_ONSET_TIME_CONSTANT_S and awaited:
                 rate = 0.0
     for i in range(3 * g, 3 * g + 3):
         now = filtered[i]

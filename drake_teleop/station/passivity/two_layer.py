@@ -14,14 +14,14 @@ from drake_teleop.station.passivity import packet as fields
 from drake_teleop.station.passivity.packet import dot_of_group, fill_packet, length_of_group
 
 # Parameters; pairs are for translation and rotation.
-_layout = slots.own_parameters()
-_SEND_RATE, _MAX_TANK_DRAIN_RATE = _layout.number(), _layout.number()
-_INITIAL_TANK_ENERGY, _TARGET_TANK_LEVEL, _TANK_CAPACITY = (_layout.vector(2) for _ in range(3))
-_DAMPING_PER_MISSING_ENERGY, MAX_PORT_ACCELERATION = _layout.vector(2), _layout.vector(2)
-_RESERVE_PER_CAPACITY = 0.01  # share of the capacity
+_parameter_slots = slots.own_parameters()
+_SEND_RATE, _MAX_TANK_DRAIN_RATE = _parameter_slots.numbers(2)
+_INITIAL_TANK_ENERGY, _TARGET_TANK_LEVEL, _TANK_CAPACITY = map(_parameter_slots.vector, [2] * 3)
+_DAMPING_PER_MISSING_ENERGY, MAX_PORT_ACCELERATION = map(_parameter_slots.vector, (2, 2))
+_RESERVE_TANK_SHARE = 0.01  # share of the capacity
 # Memory of the slave: wrench of the spring, wrench of the damper.
-_layout = slots.own_memory()
-_SERVO_SPRING_WRENCH, _SERVO_DAMPER_WRENCH = _layout.vector(6), _layout.vector(6)
+_memory_slots = slots.own_memory()
+_SERVO_SPRING_WRENCH, _SERVO_DAMPER_WRENCH = map(_memory_slots.vector, (6, 6))
 
 
 @settings
@@ -42,7 +42,7 @@ class TwoLayerConfig:
         [0.015, 3e-4], "J", 0.0, 1e6, "largest energy of a tank; any excess is discarded"
     )
     damper: list[float] = quantity(
-        [500.0, 100.0], "N s/m/J, N m s/rad/J", 0.0, 1e6, "damping of the hand for each J missing"
+        [500.0, 100.0], "N s/m/J, N m s/rad/J", 0.0, 1e6, "damping of the hand per missing energy"
     )
     acceleration: list[float] = quantity(
         [20.0, 200.0], "m/s^2, rad/s^2", 0.0, 1e6, "a_max, largest acceleration of either end"
@@ -67,7 +67,7 @@ def _update_tank_and_send_energy(received, dx, T, p, memory, packet):
     for g in range(2):
         level = ledger[g] - dot_of_group(held, dx, g)
         level += fields.count_newly_received_energy(g, received, memory)
-        sent = min(T * p[_SEND_RATE], 1.0) * max(level - _RESERVE_PER_CAPACITY * capacity[g], 0.0)
+        sent = min(T * p[_SEND_RATE], 1.0) * max(level - _RESERVE_TANK_SHARE * capacity[g], 0.0)
         level -= sent
         lost = max(level - capacity[g], 0.0)
         sent_so_far[g] += sent
@@ -122,7 +122,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
             motor_wrench[i] = spring[i] + brake[i]
         mass, own_acceleration = p[slots.SLAVE_MASS][g], p[MAX_PORT_ACCELERATION][g]
         # The spring is shortened first and leaves the reserve, so that an empty tank can brake.
-        kept = _RESERVE_PER_CAPACITY * p[_TANK_CAPACITY][g]
+        kept = _RESERVE_TANK_SHARE * p[_TANK_CAPACITY][g]
         available = max(memory[slots.STORED_ENERGY][g] - kept, 0.0)
         acceleration = own_acceleration + length_of_group(motor_wrench, g) / mass
         if _max_work_in_period_of_group(motor_wrench, dx, g, acceleration, T) > available:

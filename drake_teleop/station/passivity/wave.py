@@ -16,16 +16,16 @@ from drake_teleop.station.passivity import packet as fields
 from drake_teleop.station.passivity.packet import dot_of_group, fill_packet, limit_group
 
 # Parameters.
-_layout = slots.own_parameters()
-WAVE_IMPEDANCE = _layout.vector(2)
-_WAVE_FILTER_TIME, _MATCHING_DAMPER_SHARE = _layout.number(), _layout.number()
-_MAX_SILENCE_BEFORE_HOLD, _POSE_DRIFT_CORRECTION_RATE = _layout.number(), _layout.number()
+_parameter_slots = slots.own_parameters()
+WAVE_IMPEDANCE = _parameter_slots.vector(2)
+_WAVE_FILTER_TIME, _MATCHING_DAMPER_SHARE = _parameter_slots.numbers(2)
+_MAX_SILENCE_BEFORE_HOLD, _POSE_DRIFT_CORRECTION_RATE = _parameter_slots.numbers(2)
 # Memory: integrals of the output wave and of the sent wave; wave of this step; silence [s].
-_layout = slots.own_memory()
-_FILTERED_WAVE_INTEGRAL, _SENT_WAVE_INTEGRAL, _FILTERED_WAVE = (_layout.vector(6) for _ in range(3))
-_SILENCE_TIME, _POSE_DRIFT = _layout.number(), _layout.vector(6)
+_memory_slots = slots.own_memory()
+_FILTERED_WAVE_INTEGRAL, _SENT_WAVE_INTEGRAL, _FILTERED_WAVE = map(_memory_slots.vector, [6] * 3)
+_SILENCE_TIME, _POSE_DRIFT = _memory_slots.number(), _memory_slots.vector(6)
 # At the master: 1 from a missing packet until the wrench has caught up; newest packet number.
-_IS_WRENCH_CATCHING_UP, _NEWEST_PACKET_NUMBER = _layout.number(), _layout.number()
+_IS_WRENCH_CATCHING_UP, _NEWEST_PACKET_NUMBER = _memory_slots.numbers(2)
 
 
 @settings
@@ -45,10 +45,10 @@ class WaveConfig:
     )
     patience: float = quantity(
         0.03, "s", 0.0, 10.0,
-        "silence after which the slave keeps its command until the next packet",
+        "time without packets after which the slave keeps its command until the next packet",
     )  # fmt: skip
     drift_rate: float = quantity(
-        2.0, "1/s", 0.0, 1e3, "rate of the correction of pose drift, where it needs no energy"
+        2.0, "1/s", 0.0, 1e3, "rate of the pose drift correction, only while it takes no energy"
     )
 
     def pack_into(self, p: Array) -> None:
@@ -92,7 +92,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         limit_group(wrench, g, limits[g])
         energy = 0.5 * T * dot_of_group(wave, wave, g)
         if catching_up > 0.0:
-            most = fields.MAX_HAND_WRENCH_RATE[g] * T / p[slots.SLAVE_PER_MASTER_MOTION][g]
+            most = fields.MAX_HAND_WRENCH_RATES[g] * T / p[slots.SLAVE_PER_MASTER_MOTION][g]
             if _limit_wrench_change(g, energy, dx, most, memory[slots.LAST_PORT_WRENCH], wrench):
                 memory[_IS_WRENCH_CATCHING_UP] = 1.0
             limit_group(wrench, g, limits[g])

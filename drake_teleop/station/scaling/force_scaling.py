@@ -36,7 +36,7 @@ _NO_FAULT, _STALE_SAMPLE_FAULT, _BAD_READING_FAULT, _BAD_JOINTS_FAULT, _BAD_LOAD
 
 
 class Scales(NamedTuple):
-    """Scales of the wrench: `sigma_...` of inertia, `weight_...` of weight, gamma of contact."""
+    """Scales of the wrench: sigma of a body's inertia, weight of its weight, gamma of contact."""
 
     sigma_gripper: float
     sigma_object: float
@@ -52,23 +52,23 @@ class Scales(NamedTuple):
 @settings
 @dataclass
 class ForceScalingConfig:
-    """Settings of the force scaling: sigma, gamma, eta of the paper; scale from slave to master."""
+    """Kept shares of load and object (sigma, eta), and scales of contact and rendered wrench."""
 
-    sigma: float = quantity(1.0, "1", 0.0, 100.0, "share of the non-contact wrench that is kept")
+    sigma: float = quantity(1.0, "1", 0.0, 100.0, "kept share of the load's weight and inertia")
     gamma: float = quantity(1.0, "1", 0.0, 100.0, "scale of the contact wrench")
     eta: float | None = quantity(
-        None, "1", 0.0, 1.0, "Eq. (14): kept share of the object; needs sigma = 0 and gamma = 1"
+        None, "1", 0.0, 1.0, "kept share of the object's wrench, Eq. (14); needs sigma 0, gamma 1"
     )
     gripper_phi: list[float] | None = quantity(
         *(None, "kg, kg m, kg m^2", -1e3, 1e3, "phi of the gripper alone; null: all is gripper"),
         length=10,
     )
-    force_scale: float = quantity(1 / 17.5, "1", 0.0, 100.0, "wrench scale, slave to master (VI-B)")
+    force_scale: float = quantity(1 / 17.5, "1", 0.0, 100.0, "rendered wrench over slave's wrench")
     sigma_weight: float | None = quantity(
-        None, "1", 0.0, 100.0, "share of the load's weight that is kept; null: sigma"
+        None, "1", 0.0, 100.0, "kept share of the load's weight; null: value of sigma"
     )
     sigma_inertia: float | None = quantity(
-        None, "1", 0.0, 100.0, "share of the load's inertia that is kept; null: sigma"
+        None, "1", 0.0, 100.0, "kept share of the load's inertia; null: value of sigma"
     )
 
     def scales(self, where: str = "force_scaling") -> Scales:
@@ -105,7 +105,7 @@ def blend_scales_at(ramp, time, scales):
     """Write the scales at `time` [s], a minimum-jerk blend from old to new ones, to `scales` (6,).
 
     `ramp` (14,) contains old scales (6), new scales (6), start of the ramp [s], duration [s].
-    Scales are sigma of gripper and object, gamma, force scale, weights of gripper and object.
+    Scales: sigma of gripper and object, gamma, force scale, weight scales of gripper and object.
     """
     u = min(max((time - ramp[12]) / ramp[13], 0.0), 1.0) if ramp[13] > 0.0 else 1.0
     share = u * u * u * (10.0 + u * (6.0 * u - 15.0))
@@ -287,7 +287,7 @@ class ForceScaling(LeafSystem):
     ) -> None:
         """Change the scales on a minimum-jerk ramp of `duration` [s] that starts now.
 
-        `sigma_weight` scales both weights; None: sigma_gripper and sigma_object do.
+        `sigma_weight` scales the weight of both bodies; None: as their inertia.
         """
         both = sigma_gripper, sigma_object
         weights = both if sigma_weight is None else (sigma_weight, sigma_weight)

@@ -27,7 +27,7 @@ class KinematicScalingConfig:
     translation_scale: float = quantity(1.0, "1", 0.0, 100.0, "slave over master translation")
     rotation_scale: float = quantity(1.0, "1", 0.0, 10.0, "slave over master angle")
     alignment: list[float] = quantity(
-        [0.0] * 3, "rad", -7.0, 7.0, "R_WB as roll, pitch, yaw (Drake's RollPitchYaw)"
+        [0.0] * 3, "rad", -7.0, 7.0, "roll, pitch, yaw of the master's base B in the world W"
     )
 
     @property

@@ -54,12 +54,12 @@ _NUM_ANGLE_LOW_PASS_SECTIONS = 4
 # Memory: samples taken, samples for which the flag stays; state of `_update_fusion_filters` for
 # angle and displacement, each with the accelerometer's error and the last R_WS or p_WS; scratch for
 # kinematics; per joint: velocity, acceleration, last three angles, low-passes; delay line.
-_FLAGGED_SAMPLES_LEFT_INDEX = 1
-_ANGULAR_FUSION_FILTER_START = 2
+_FLAG_COUNTDOWN_INDEX = 1
+_ANGULAR_FUSION_START_INDEX = 2
 _FUSION_FILTER_MEMORY_SIZE = 24
-_LINEAR_FUSION_FILTER_START = _ANGULAR_FUSION_FILTER_START + _FUSION_FILTER_MEMORY_SIZE
-_KINEMATICS_SCRATCH_START = _LINEAR_FUSION_FILTER_START + _FUSION_FILTER_MEMORY_SIZE
-_JOINT_MEMORY_START = _KINEMATICS_SCRATCH_START + serial_arm.SENSOR_MOTION_SIZE
+_LINEAR_FUSION_START_INDEX = _ANGULAR_FUSION_START_INDEX + _FUSION_FILTER_MEMORY_SIZE
+_SCRATCH_START_INDEX = _LINEAR_FUSION_START_INDEX + _FUSION_FILTER_MEMORY_SIZE
+_JOINTS_START_INDEX = _SCRATCH_START_INDEX + serial_arm.SENSOR_MOTION_SIZE
 _MEMORY_SIZE_PER_JOINT = 5 + 2 * _NUM_ANGLE_LOW_PASS_SECTIONS
 
 
@@ -68,12 +68,12 @@ _MEMORY_SIZE_PER_JOINT = 5 + 2 * _NUM_ANGLE_LOW_PASS_SECTIONS
 class MotionEstimationConfig:
     """Settings of the estimation of the motion of the sensor frame S."""
 
-    source: str = choice("accelerometer", _MOTION_SOURCES, "source of omega and accelerations")
+    source: str = choice("accelerometer", _MOTION_SOURCES, "source of the estimated motion")
     encoder_bandwidth_hz: float = quantity(
         50.0, "Hz", 1.0, 1e4, "low-pass of the angles, 4th-order Butterworth (source `encoders`)"
     )
     acceleration_drift: float = quantity(
-        0.05, "m/s^2/sqrt(s)", 1e-6, 1e3, "random walk of the error of s (source `fused`)"
+        0.05, "m/s^2/sqrt(s)", 1e-6, 1e3, "random walk of the specific-force error (source `fused`)"
     )
     angular_acceleration_drift: float = quantity(
         0.5, "rad/s^2/sqrt(s)", 1e-6, 1e4, "random walk of the error of alpha (source `fused`)"
@@ -97,7 +97,7 @@ def steady_state_kalman_gains(
 ) -> Array:
     """Return Kalman gains (3,) from innovation to position [1], rate [1/s], acceleration [1/s^2].
 
-    The filter has a measured position, and a measured acceleration with a drifting error.
+    The filter fuses a measured position and a measured acceleration with a drifting error.
 
     Args:
         position_std: standard deviation of a measured position, in any unit.
@@ -126,7 +126,7 @@ def path_delays(
     config: MotionEstimationConfig, sensor: WristSensorConfig, period: float
 ) -> PathDelays:
     wrench, acceleration, encoders = sensor.reading_delays(period)
-    sections = _angle_low_pass_sections(config, sensor, period)
+    sections = _joint_angle_filter_sections(config, sensor, period)
     encoders += float(np.sum([group_delay_samples(section) for section in sections])) * period
     sources = (encoders,) if config.source == "encoders" else (acceleration, encoders)
     waits = np.ceil((max(sources) - wrench) / period - 1e-6)
@@ -156,7 +156,7 @@ def estimated_motion_std(
     shift = np.exp(-1j * np.pi * (np.arange(1 << 14) + 0.5) / (1 << 14))
     response = [
         np.polyval([b2, b1, b0], shift) / np.polyval([a2, a1, 1.0], shift)
-        for b0, b1, b2, a1, a2 in _angle_low_pass_sections(config, sensor, period)
+        for b0, b1, b2, a1, a2 in _joint_angle_filter_sections(config, sensor, period)
     ]
     differenced = np.polyval([-1.0, 4.0, -5.0, 2.0], shift) / period**2
     power = np.mean(np.abs(np.prod(response, axis=0) * differenced) ** 2)
@@ -199,16 +199,16 @@ def initialize_motion_estimator(
         wait_samples=waits,
         accelerometer_position=p_SoAo_S,
         R_SA=R_SA,
-        angle_low_passes=_angle_low_pass_sections(config, sensor, period),
+        angle_low_passes=_joint_angle_filter_sections(config, sensor, period),
         angle_gains=angle_gains,
         linear_gains=linear_gains,
     )
     rows = int(np.ceil(waits.max())) + 1
     size = _MEMORY_SIZE_PER_JOINT * num_joints + rows * (12 + num_joints)
-    return constants, np.zeros(_JOINT_MEMORY_START + size)
+    return constants, np.zeros(_JOINTS_START_INDEX + size)
 
 
-def _angle_low_pass_sections(
+def _joint_angle_filter_sections(
     config: MotionEstimationConfig, sensor: WristSensorConfig, period: float
 ) -> Array:
     filters = np.zeros((_NUM_ANGLE_LOW_PASS_SECTIONS, 5))
@@ -234,13 +234,13 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
         sample: (16 + n,) written, see `drake_teleop.load.regressor`.
     """
     constants, n = constants[0], sample.shape[0] - regressor.FIRST_JOINT_INDEX
-    motion = memory[_KINEMATICS_SCRATCH_START:_JOINT_MEMORY_START]
+    motion = memory[_SCRATCH_START_INDEX:_JOINTS_START_INDEX]
     angles, gravity = sample[regressor.SAMPLE_JOINT_POSITIONS], motion[:3]
     _equalize_signal_delays(constants, memory, n, reading, sample)
     if arm.shape[0] == 0:
         copy_into(motion, 3, angles, 0, 3)
     else:
-        joints = memory[_JOINT_MEMORY_START:][: _MEMORY_SIZE_PER_JOINT * n]
+        joints = memory[_JOINTS_START_INDEX:][: _MEMORY_SIZE_PER_JOINT * n]
         _differentiate_joint_angles(constants, memory[0] == 0.0, joints, angles)
         serial_arm.sensor_motion(arm, angles, joints[:n], joints[n:], motion)
         gravity = arm[n, serial_arm.LAST_ROW_GRAVITY_COLUMN :]
@@ -253,10 +253,10 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
 
 @njit(cache=True)
 def measure_sample_into(sensor, arm, noise, truth, chain_memory, estimator_memory, sample):
-    """Write the `sample` (`load.regressor`) that sensor chain and motion estimator make of `truth`.
+    """Write the wrist sensor's `sample` of the true values `truth`, once per period.
 
-    Implausible values flag the last sample instead. `sensor` is (constants of the chain, constants
-    of the estimator, ideal). Others: see `read_sensor_into`.
+    If `truth` is implausible, keep the last sample and flag it. `sensor` contains the constants of
+    sensor chain and estimator, and whether the sensor is ideal. Others: see `read_sensor_into`.
     """
     chain, estimator, ideal = sensor
     flag = regressor.SATURATION_FLAG_INDEX
@@ -279,12 +279,12 @@ def measure_sample_into(sensor, arm, noise, truth, chain_memory, estimator_memor
 @njit(cache=True)
 def _equalize_signal_delays(constants, memory, num_joints, reading, sample):
     sections, angles = constants.angle_low_passes[:], sample[regressor.SAMPLE_JOINT_POSITIONS]
-    filtered = memory[_JOINT_MEMORY_START:][: _MEMORY_SIZE_PER_JOINT * num_joints][5 * num_joints :]
+    filtered = memory[_JOINTS_START_INDEX:][: _MEMORY_SIZE_PER_JOINT * num_joints][5 * num_joints :]
     copy_into(angles, 0, reading, READ_ANGLES.start, num_joints)
     if memory[0] == 0.0:
         settle_low_pass(sections, filtered, angles)
     low_pass_in_place(sections, filtered, angles)
-    delay_line = memory[_JOINT_MEMORY_START + _MEMORY_SIZE_PER_JOINT * num_joints :]
+    delay_line = memory[_JOINTS_START_INDEX + _MEMORY_SIZE_PER_JOINT * num_joints :]
     line = delay_line.reshape((-1, 12 + num_joints))
     shift_delay_line(line)
     copy_into(line[0], 0, reading, 0, 12)
@@ -298,10 +298,10 @@ def _equalize_signal_delays(constants, memory, num_joints, reading, sample):
     now, before = line[wait], line[min(wait + 1, line.shape[0] - 1)]
     for i in range(num_joints):
         angles[i] = (1.0 - older) * now[12 + i] + older * before[12 + i]
-    flagged = memory[_FLAGGED_SAMPLES_LEFT_INDEX] - 1.0
+    flagged = memory[_FLAG_COUNTDOWN_INDEX] - 1.0
     if reading[READ_SATURATED] != 0.0:
         flagged = float(line.shape[0])
-    memory[_FLAGGED_SAMPLES_LEFT_INDEX] = max(flagged, 0.0)
+    memory[_FLAG_COUNTDOWN_INDEX] = max(flagged, 0.0)
     sample[regressor.SATURATION_FLAG_INDEX] = 1.0 if flagged > 0.0 else 0.0
 
 
@@ -328,8 +328,8 @@ def _convert_and_fuse_accelerometer(constants, memory, gravity, motion, sample):
     s[0], s[1], s[2] = apply_matrix(R_SA, vector_at(s, 0))
     copy_into(omega, 0, motion, 3, 3)
 
-    angular = memory[_ANGULAR_FUSION_FILTER_START:_LINEAR_FUSION_FILTER_START]
-    linear = memory[_LINEAR_FUSION_FILTER_START:_KINEMATICS_SCRATCH_START]
+    angular = memory[_ANGULAR_FUSION_START_INDEX:_LINEAR_FUSION_START_INDEX]
+    linear = memory[_LINEAR_FUSION_START_INDEX:_SCRATCH_START_INDEX]
     if fused:
         if starts:
             copy_into(angular, 3, omega, 0, 3)
@@ -376,12 +376,12 @@ def _small_rotation_vector_into(R_before, R, rotation_vector):
 
 
 @njit(cache=True)
-def _update_fusion_filters(gains, period, displacement_to_correction, acceleration, filter_memory):
+def _update_fusion_filters(gains, period, change_in_correction_out, acceleration, filter_memory):
     for i in range(3):
         mean = (acceleration[i] + 10.0 * filter_memory[6 + i] + filter_memory[9 + i]) / 12.0
         rate = filter_memory[3 + i] + period * mean
-        innovation = filter_memory[i] + displacement_to_correction[i] - period * rate
+        innovation = filter_memory[i] + change_in_correction_out[i] - period * rate
         filter_memory[i] = innovation - gains[0] * innovation
         filter_memory[3 + i] = rate + gains[1] * innovation
         filter_memory[9 + i] = filter_memory[6 + i]
-        displacement_to_correction[i] = gains[2] * innovation
+        change_in_correction_out[i] = gains[2] * innovation

@@ -1,7 +1,7 @@
 """Wrist sensor at a weld of any MultibodyPlant, continuous or discrete.
 
-If the plant samples its output ports, reaction and acceleration belong to the state before a step.
-The block stores pose and velocity of that state, so that a sample has the values of one instant.
+A plant with sampled outputs returns reaction and acceleration of the state before a step. The block
+stores pose and velocity of that state for each sample.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ from drake_teleop.station.sensor.motion_estimation import (
 from drake_teleop.station.sensor.sensor_chain import (
     NOISE_BLOCK_SIZE,
     SAMPLES_PER_NOISE_BLOCK,
-    TRUE_JOINT_ANGLES,
+    TRUE_ANGLES_SLICE,
     WristSensorConfig,
     initialize_sensor_chain,
 )
 
-_ERROR_LOCATION = "AddWristSensor"
+_MESSAGE_PREFIX = "AddWristSensor"
 _DEFAULT_SAMPLING_PERIOD_S, _STEP_RATIO_TOLERANCE = 1e-3, 1e-6
 # Output ports of a plant that the sensor reads, with the type of their elements.
 _PLANT_PORT_TYPES = {"body_poses": RigidTransform, "body_spatial_velocities": SpatialVelocity}
@@ -78,8 +78,8 @@ def AddWristSensor(
     """Add a wrist sensor to a finalized plant of this builder, and connect it.
 
     Args:
-        joint_or_frame: weld between arm and tool; S is then its frame on the arm. Or S itself, a
-            frame on a body of the arm with exactly one weld to a body beyond it.
+        joint_or_frame: weld between arm and tool, whose frame on the arm becomes S; or frame S on
+            a body of the arm with exactly one weld to a body beyond it.
         config: errors of the sensor; None for an ideal sensor.
         period: sampling period [s]; a multiple of a discrete plant's time step, by default equal
             to it, or 1 ms for a continuous plant.
@@ -92,7 +92,7 @@ def AddWristSensor(
     """
     _check_finalized_in_builder(builder, plant)
     config = WristSensorConfig(ideal=True) if config is None else config
-    expect_type(WristSensorConfig, config, f"{_ERROR_LOCATION}: config", "take one of PRESETS")
+    expect_type(WristSensorConfig, config, f"{_MESSAGE_PREFIX}: config", "take one of PRESETS")
     sensor = PlantWristSensor(plant, joint_or_frame, config, period, model_instance)
     builder.AddNamedSystem(name, sensor)
     state = plant.get_state_output_port(*([] if model_instance is None else [model_instance]))
@@ -147,9 +147,9 @@ class PlantWristSensor(DoubleOnlySystem, LeafSystem):
         S, joint = _sensor_frame_and_weld(plant, joint_or_frame)
         self._weld = _weld_properties(plant, S, joint)
         step = plant.time_step() or None
-        self._step_s, self._steps_per_sample = _event_period_and_sample_steps(step, period)
+        self._step_s, self._steps_per_sample = _event_period_and_step_count(step, period)
         self._pairs_steps = step is not None and plant.has_sampled_output_ports()
-        config.check(_ERROR_LOCATION, 1 / self.period)
+        config.check(_MESSAGE_PREFIX, 1 / self.period)
 
         which = [] if model_instance is None else [model_instance]
         n = self._n = plant.num_positions(*which)
@@ -218,7 +218,7 @@ class PlantWristSensor(DoubleOnlySystem, LeafSystem):
         acceleration = self._accelerations.Eval(context)[body].get_coeffs()
         force = self._reactions.Eval(context)[reaction].get_coeffs()
         noise = self._no_noise if self._noise is None else self._noise.Eval(context)
-        truth = np.empty(TRUE_JOINT_ANGLES.start + 3 + self._n)
+        truth = np.empty(TRUE_ANGLES_SLICE.start + 3 + self._n)
         _true_sensor_values_into(geometry, configuration, acceleration, force, truth)
         sample = discrete_state.get_mutable_value(_SAMPLE_GROUP_INDEX)
         filters = (discrete_state.get_mutable_value(group) for group in _FILTER_GROUP_INDICES)
@@ -242,63 +242,63 @@ def _true_sensor_values_into(geometry, configuration, acceleration, reaction, tr
     for i in range(3):
         truth[i], truth[3 + i] = sign * f[i], sign * tau[i]
         truth[6 + i], truth[9 + i], truth[12 + i] = s[i], omega[i], alpha[i]
-        truth[TRUE_JOINT_ANGLES.start + i] = omega[i]
+        truth[TRUE_ANGLES_SLICE.start + i] = omega[i]
     n = configuration.shape[0] - _BODY_ROTATION_AND_OMEGA_SIZE
-    copy_into(truth, TRUE_JOINT_ANGLES.start + 3, configuration, _BODY_ROTATION_AND_OMEGA_SIZE, n)
+    copy_into(truth, TRUE_ANGLES_SLICE.start + 3, configuration, _BODY_ROTATION_AND_OMEGA_SIZE, n)
 
 
 def _check_finalized_in_builder(builder: DiagramBuilder, plant: MultibodyPlant) -> None:
-    expect_type(MultibodyPlant, plant, f"{_ERROR_LOCATION}: plant")
+    expect_type(MultibodyPlant, plant, f"{_MESSAGE_PREFIX}: plant")
     if not plant.is_finalized():
         what = f"plant '{plant.get_name()}' is not finalized"
-        raise DrakeTeleopError(what, where=_ERROR_LOCATION, remedy="call plant.Finalize() first")
+        raise DrakeTeleopError(what, where=_MESSAGE_PREFIX, remedy="call plant.Finalize() first")
     if plant not in builder.GetSystems():
         what = f"plant '{plant.get_name()}' is not in this builder"
         remedy = "add it by builder.AddSystem(plant) first"
-        raise DrakeTeleopError(what, where=_ERROR_LOCATION, remedy=remedy)
+        raise DrakeTeleopError(what, where=_MESSAGE_PREFIX, remedy=remedy)
 
 
-def _event_period_and_sample_steps(step: float | None, period: float | None) -> tuple[float, int]:
+def _event_period_and_step_count(step: float | None, period: float | None) -> tuple[float, int]:
     if period is not None and not 0.0 < period < np.inf:
         what = f"a sampling period of {period} s is not positive and finite"
         remedy = "give the time between samples [s]"
-        raise DrakeTeleopError(what, where=f"{_ERROR_LOCATION}: period", remedy=remedy)
+        raise DrakeTeleopError(what, where=f"{_MESSAGE_PREFIX}: period", remedy=remedy)
     if step is None:
         return period or _DEFAULT_SAMPLING_PERIOD_S, 1
     count = (period or step) / step
     if count < 1 - _STEP_RATIO_TOLERANCE or abs(count - round(count)) > _STEP_RATIO_TOLERANCE:
         what = f"sampling period {period:g} s is no multiple of the plant's time step {step:g} s"
         remedy = f"choose a multiple, such as {max(1, round(count)) * step:g} s"
-        raise DrakeTeleopError(what, where=f"{_ERROR_LOCATION}: period", remedy=remedy)
+        raise DrakeTeleopError(what, where=f"{_MESSAGE_PREFIX}: period", remedy=remedy)
     return step, round(count)
 
 
 def _sensor_frame_and_weld(
     plant: MultibodyPlant, joint_or_frame: Joint | Frame
 ) -> tuple[Frame, WeldJoint]:
-    expect_type((Joint, Frame), joint_or_frame, f"{_ERROR_LOCATION}: joint_or_frame")
+    expect_type((Joint, Frame), joint_or_frame, f"{_MESSAGE_PREFIX}: joint_or_frame")
     if joint_or_frame.GetParentPlant() is not plant:
         what = f"joint or frame '{joint_or_frame.name()}' belongs to another plant"
         remedy = "pass a joint or frame of this plant"
-        raise DrakeTeleopError(what, where=f"{_ERROR_LOCATION}: joint_or_frame", remedy=remedy)
+        raise DrakeTeleopError(what, where=f"{_MESSAGE_PREFIX}: joint_or_frame", remedy=remedy)
     welds = [joint for joint in _joints_of_plant(plant) if isinstance(joint, WeldJoint)]
     if isinstance(joint_or_frame, Frame):
         S = joint_or_frame
         body = S.body().index()
-        beyond = [joint for joint in welds if _arm_body_and_load(plant, joint)[0] == body]
+        beyond = [joint for joint in welds if _arm_body_and_tool(plant, joint)[0] == body]
         if len(beyond) != 1:
             names = ", ".join(f"'{joint.name()}'" for joint in beyond)
             found = f"several welds beyond it: {names}" if beyond else "no weld beyond it"
             what = f"the body '{S.body().name()}' of frame '{S.name()}' has {found}"
             remedy = "pass the WeldJoint between arm and tool"
-            raise DrakeTeleopError(what, where=f"{_ERROR_LOCATION}: joint_or_frame", remedy=remedy)
+            raise DrakeTeleopError(what, where=f"{_MESSAGE_PREFIX}: joint_or_frame", remedy=remedy)
         return S, beyond[0]
     if not isinstance(joint_or_frame, WeldJoint):
         what = f"joint '{joint_or_frame.name()}' is {joint_or_frame.type_name()}, not a weld"
         remedy = "weld the tool to the arm and pass this WeldJoint"
-        raise DrakeTeleopError(what, where=f"{_ERROR_LOCATION}: joint_or_frame", remedy=remedy)
+        raise DrakeTeleopError(what, where=f"{_MESSAGE_PREFIX}: joint_or_frame", remedy=remedy)
     parent = joint_or_frame.frame_on_parent()
-    arm, _ = _arm_body_and_load(plant, joint_or_frame)
+    arm, _ = _arm_body_and_tool(plant, joint_or_frame)
     on_parent = parent.body().index() == arm
     return parent if on_parent else joint_or_frame.frame_on_child(), joint_or_frame
 
@@ -307,7 +307,7 @@ def _joints_of_plant(plant: MultibodyPlant) -> list[Joint]:
     return [plant.get_joint(index) for index in plant.GetJointIndices()]
 
 
-def _arm_body_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyIndex, list[BodyIndex]]:
+def _arm_body_and_tool(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyIndex, list[BodyIndex]]:
     others = [joint for joint in _joints_of_plant(plant) if joint.index() != weld.index()]
     ends = [(int(j.parent_body().index()), int(j.child_body().index())) for j in others]
     linked = np.zeros((plant.num_bodies(), plant.num_bodies()))
@@ -322,16 +322,15 @@ def _arm_body_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyInde
 def _weld_properties(
     plant: MultibodyPlant, S: Frame, joint: WeldJoint
 ) -> tuple[int, int, tuple[Array | float, ...]]:
-    """Return reaction index and body index (body B of S) in the plant's ports, and geometry.
+    """Return indices of the weld's reaction and of S's body B in the plant's ports, and constants.
 
-    The geometry is p_BoSo_B, R_BS, R_SJc (Jc: frame of the reaction), p_SoJc_S, gravity in W, and
-    the sign from the reaction to the load's wrench.
+    These are p_BoSo_B, R_BS, R_SJc, p_SoJc_S (reaction frame Jc), gravity in W, reaction's sign.
     """
-    arm, load = _arm_body_and_load(plant, joint)
+    arm, load = _arm_body_and_tool(plant, joint)
     if not sum(plant.get_body(body).default_mass() for body in load) > 0.0:
         what = f"the tool beyond joint '{joint.name()}' has no mass"
         remedy = "give a body of the tool a SpatialInertia"
-        raise DrakeTeleopError(what, where=f"{_ERROR_LOCATION}: joint_or_frame", remedy=remedy)
+        raise DrakeTeleopError(what, where=f"{_MESSAGE_PREFIX}: joint_or_frame", remedy=remedy)
     on_parent = joint.parent_body().index() == arm
     X_BS, X_BJc = S.GetFixedPoseInBodyFrame(), joint.frame_on_child().GetFixedPoseInBodyFrame()
     if on_parent:

@@ -53,10 +53,10 @@ PRESET_NAMES = (
     *("ideal", "jr3_85m35a3", "ati_gamma_imu", "ati_mini45", "bota_sensone", "bota_rokubi"),
     *("robotiq_ft300", "onrobot_hex_e", "ur5e_built_in", "franka_estimated"),
 )
-_LOW_PASS_POSITIONS = ("none", "before_noise", "after_converter")
+_LOW_PASS_STAGES = ("none", "before_noise", "after_converter")
 _NUM_LOW_PASS_SECTIONS = 2  # second-order sections of the fourth-order low-pass
 _MAX_ORTHOGONALITY_ERROR_OF_R_SA = 1e-6
-_OVERLOAD_LIMIT_IN_RANGES = 10.0
+_OVERLOAD_TO_RANGE_RATIO = 10.0
 # The low-pass overshoots by 11 % of a step, which may be two ranges.
 _MAX_SATURATED_READING_TO_RANGE_RATIO = 1.5
 
@@ -77,21 +77,21 @@ class WristSensorConfig:
             "in_python": "set wrist_sensor = drake_teleop.station.sensor.presets.PRESETS[name]",
         },
     )
-    ideal: bool = plain(False, "true values at the sampling instant, at So in S, without errors")
+    ideal: bool = plain(False, "no sensor errors: true values in sensor frame S, without delay")
 
     gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest gain error of force and torque")
-    cross_talk: float = quantity(0.0, "1", 0.0, 0.1, "full-range cross-talk as share of own range")
-    misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "angle from S to the real wrench axes")
+    cross_talk: float = quantity(0.0, "1", 0.0, 0.1, "cross-talk at another channel's full range")
+    misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "rotation error of the wrench axes from S")
     acceleration_gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest acceleration gain error")
-    acceleration_misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "angle from A to real axes")
-    unit: int = quantity(0, "1", 0, 2**32 - 1, "seed of the calibration errors within their bounds")
+    acceleration_misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "rotation error of axes A")
+    unit: int = quantity(0, "1", 0, 2**32 - 1, "unit number, seed of the calibration errors")
 
     p_SoAo_S: list[float] = quantity([0.0, 0.0, 0.0175], "m", -1.0, 1.0, "accelerometer position")
     R_SA: list[float] = quantity(
         [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], "1", -1.0, 1.0, "accelerometer axes by rows"
     )
 
-    low_pass: str = choice("after_converter", _LOW_PASS_POSITIONS, "low-pass position in the chain")
+    low_pass: str = choice("after_converter", _LOW_PASS_STAGES, "low-pass position in the chain")
     bandwidth_hz: float = quantity(500.0, "Hz", 1.0, 1e5, "4th-order Butterworth low-pass")
 
     force_noise: float = quantity(0.25, "N", 0.0, 100.0, "white noise of raw samples, 1 sigma")
@@ -117,8 +117,8 @@ class WristSensorConfig:
     encoder_resolution: float = quantity(1.745e-5, "rad", 0.0, 0.1, "resolver step, 0.001 deg")
 
     saturates: bool = plain(True, "readings are limited to the ranges and flagged by `saturated`")
-    force_range: list[float] = quantity([200.0, 200.0, 400.0], "N", 1.0, 1e5, "range of fx, fy, fz")
-    torque_range: list[float] = quantity([12.0] * 3, "N m", 0.01, 1e4, "range of tx, ty, tz at So")
+    force_range: list[float] = quantity([200.0, 200.0, 400.0], "N", 1.0, 1e5, "force range x, y, z")
+    torque_range: list[float] = quantity([12.0] * 3, "N m", 0.01, 1e4, "torque range x, y, z at So")
     acceleration_range: float = quantity(50.0, "m/s^2", 1.0, 1e4, "range of each axis")
     angular_acceleration_range: float = quantity(500.0, "rad/s^2", 1.0, 1e5, "range of each axis")
 
@@ -142,7 +142,7 @@ class WristSensorConfig:
     def largest_plausible_wrench(self) -> Array:
         """Return the largest plausible absolute readings (6,) of force and torque [N, N m]."""
         limited = self.saturates and not self.ideal
-        factor = _MAX_SATURATED_READING_TO_RANGE_RATIO if limited else _OVERLOAD_LIMIT_IN_RANGES
+        factor = _MAX_SATURATED_READING_TO_RANGE_RATIO if limited else _OVERLOAD_TO_RANGE_RATIO
         return factor * self.ranges()[:6]
 
     def wrench_std(self) -> Array:
@@ -189,9 +189,9 @@ class WristSensorConfig:
 
 def check_bandwidth(bandwidth_hz: float, rate_hz: float, where: str, alternative: str = "") -> None:
     if bandwidth_hz >= 0.45 * rate_hz:
-        what = f"a bandwidth of {bandwidth_hz:g} Hz is too near to half of the sensor's rate"
+        what = f"bandwidth {bandwidth_hz:g} Hz is too near half the sensor's rate ({rate_hz:g} Hz)"
         remedy = f"lower the bandwidth below 0.45 of the sensor's rate{alternative}"
-        raise DrakeTeleopError(f"{what} ({rate_hz:g} Hz)", where=where, remedy=remedy)
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
 
 
 _CALIBRATION_ERROR_FIELDS = (
@@ -246,7 +246,7 @@ def calibration_matrices(config: WristSensorConfig) -> tuple[Array, Array, Array
     """Return random matrices from true values to values with calibration errors.
 
     They are (6, 6) for [f; tau] in S, (3, 3) for specific force and (3, 3) for angular acceleration
-    in A. The seed is `config.unit`.
+    in A. `config.unit` is their seed.
     """
     random = np.random.default_rng(config.unit)
     gains, talk = random.uniform(-1, 1, 6), random.uniform(-1, 1, (6, 6))
@@ -267,26 +267,23 @@ def _rotation_about_axis(axis: Array, angle: float) -> Array:
 
 
 # True values: as a sample (`drake_teleop.load.regressor`) without the flag.
-TRUE_JOINT_ANGLES = slice(15, None)
+TRUE_ANGLES_SLICE = slice(15, None)
 # A reading: wrench, accelerometer, whether a channel is saturated, angles.
 READ_WRENCH, READ_ACCELERATION = slice(0, 6), slice(6, 12)
 READ_SATURATED, READ_ANGLES = 12, slice(13, None)
-_LOW_PASS_BEFORE_NOISE, _LOW_PASS_AFTER_CONVERTER = 1.0, 2.0  # as in _LOW_PASS_POSITIONS
+_LOW_PASS_BEFORE_NOISE, _LOW_PASS_AFTER_CONVERTER = 1.0, 2.0  # as in _LOW_PASS_STAGES
 # Memory: samples taken, 12 random walks, filter (2, 2, 12), delay line with a row per sample: 12
 # channels, saturation of force and of acceleration, angles.
-_RANDOM_WALK_MEMORY_START = 1
-FILTER_MEMORY_START = _RANDOM_WALK_MEMORY_START + _NUM_NOISY_CHANNELS
-_DELAY_LINE_MEMORY_START = FILTER_MEMORY_START + 2 * _NUM_LOW_PASS_SECTIONS * _NUM_NOISY_CHANNELS
-_DELAYED_ANGLES_START = _NUM_NOISY_CHANNELS + 2
+_RANDOM_WALK_START_INDEX = 1
+FILTER_START_INDEX = _RANDOM_WALK_START_INDEX + _NUM_NOISY_CHANNELS
+_DELAY_LINE_START_INDEX = FILTER_START_INDEX + 2 * _NUM_LOW_PASS_SECTIONS * _NUM_NOISY_CHANNELS
+_DELAYED_ANGLES_INDEX = _NUM_NOISY_CHANNELS + 2
 
 
 def initialize_sensor_chain(
     config: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[Records, Array]:
-    """Return constants and initial memory of `read_sensor_into` for an arm with n joints.
-
-    `constants[0].offset[:6]` is the wrench's offset [N, N m]; `memory[0]` counts samples.
-    """
+    """Return constants and initial memory of `read_sensor_into`."""
     if config.ideal:
         config = without_parts(config, *DISABLED_PART_VALUES)
     wrench, force, angular = calibration_matrices(config)
@@ -310,13 +307,13 @@ def initialize_sensor_chain(
         motion_calibration=[force @ R_SA.T, angular @ R_SA.T],
         accelerometer_position=p_SoAo_S,
         low_pass=sections,
-        low_pass_stage=_LOW_PASS_POSITIONS.index(config.low_pass),
+        low_pass_stage=_LOW_PASS_STAGES.index(config.low_pass),
         latency_samples=latencies,
         encoder_quantum=config.encoder_resolution,
-        overload_limits=_OVERLOAD_LIMIT_IN_RANGES * ranges[:6],
+        overload_limits=_OVERLOAD_TO_RANGE_RATIO * ranges[:6],
     )
-    size = (latencies.max() + 1) * (_DELAYED_ANGLES_START + num_joints)
-    return constants, np.zeros(_DELAY_LINE_MEMORY_START + size)
+    size = (latencies.max() + 1) * (_DELAYED_ANGLES_INDEX + num_joints)
+    return constants, np.zeros(_DELAY_LINE_START_INDEX + size)
 
 
 @njit(cache=True)
@@ -343,13 +340,13 @@ def read_sensor_into(constants, memory, noise, truth, reading):
         reading: (13 + n,) written: [wrench (6) | specific force at Ao (3), angular acceleration (3)
             in A | 1 if a channel is saturated, else 0 | joint angles (n)].
     """
-    constants, angles = constants[0], truth[TRUE_JOINT_ANGLES]
+    constants, angles = constants[0], truth[TRUE_ANGLES_SLICE]
     count = int(memory[0])
-    line = memory[_DELAY_LINE_MEMORY_START:].reshape((-1, _DELAYED_ANGLES_START + angles.shape[0]))
+    line = memory[_DELAY_LINE_START_INDEX:].reshape((-1, _DELAYED_ANGLES_INDEX + angles.shape[0]))
     shift_delay_line(line)
     row, channels = line[0], line[0, :_NUM_NOISY_CHANNELS]
-    walks = memory[_RANDOM_WALK_MEMORY_START:FILTER_MEMORY_START]
-    filtered = memory[FILTER_MEMORY_START:_DELAY_LINE_MEMORY_START]
+    walks = memory[_RANDOM_WALK_START_INDEX:FILTER_START_INDEX]
+    filtered = memory[FILTER_START_INDEX:_DELAY_LINE_START_INDEX]
     sections, place = constants.low_pass[:], constants.low_pass_stage
     if count % SAMPLES_PER_NOISE_BLOCK == 0:
         step = noise[_NUM_NOISY_CHANNELS * SAMPLES_PER_NOISE_BLOCK :]
@@ -372,7 +369,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     row[_NUM_NOISY_CHANNELS + 1] = _quantize_and_saturate_channels(constants, 6, 12, channels)
     if place == _LOW_PASS_AFTER_CONVERTER:
         low_pass_in_place(sections, filtered, channels)
-    quantum, turned = constants.encoder_quantum, row[_DELAYED_ANGLES_START:]
+    quantum, turned = constants.encoder_quantum, row[_DELAYED_ANGLES_INDEX:]
     for i in range(angles.shape[0]):
         turned[i] = quantum * np.rint(angles[i] / quantum) if quantum > 0.0 else angles[i]
 
@@ -385,12 +382,12 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     copy_into(reading, READ_ACCELERATION.start, acceleration, 6, 6)
     reading[READ_SATURATED] = max(force[_NUM_NOISY_CHANNELS], acceleration[_NUM_NOISY_CHANNELS + 1])
     encoders = line[int(late[2])]
-    copy_into(reading, READ_ANGLES.start, encoders, _DELAYED_ANGLES_START, angles.shape[0])
+    copy_into(reading, READ_ANGLES.start, encoders, _DELAYED_ANGLES_INDEX, angles.shape[0])
 
 
 @njit(cache=True)
 def shift_delay_line(line):
-    """Shift the rows of the delay line by one; row 0 becomes free."""
+    """Copy each row of the delay line to the next one; row 0 is then to be overwritten."""
     for k in range(line.shape[0] - 1, 0, -1):
         copy_into(line[k], 0, line[k - 1], 0, line.shape[1])
 

@@ -3,7 +3,7 @@
     truth --[sensor_chain]--> reading --[motion_estimation]--> sample
 
 The state at each sampling instant is interpolated within an integration step. If Drake calculates
-the contact (`ToolContactModel.drake_contact_reason`), each sample is an event at a step's end.
+the contact, each sample is an event at a step's end.
 """
 
 from __future__ import annotations
@@ -64,15 +64,15 @@ _EQUAL_TIME_TOLERANCE_PERIODS, _MAX_QUEUED_PLANT_STEPS = 1e-6, 16
 #: tolerance: rounding is 1e-12, in a stiff contact 1e-9.
 _ACCELERATION_CHECK_PERIOD_S, _ACCELERATION_CHECK_TOLERANCE = 0.1, 1e-6
 #: Value of `contact_W` in `take_due_samples` that selects the compiled contact law.
-_EMPTY_WRENCH_FOR_COMPILED_CONTACT = np.zeros(0)
+_NO_GIVEN_CONTACT_WRENCH = np.zeros(0)
 
 
 @njit(cache=True)
 def true_sample_into(arm, phi, q, v, vdot, contact_W, out):
     """Write the true wrench, specific force, omega and alpha of S into `out[:15]`.
 
-    `contact_W` (6,) is the wrench of the environment on the tool about the world's origin, in W;
-    `phi` (10,) are the tool's inertial parameters.
+    `contact_W` (6,) is the wrench of the environment on the tool about Wo, in W; `phi` (10,) are
+    the tool's inertial parameters.
     """
     motion = np.empty(serial_arm.SENSOR_MOTION_SIZE)
     serial_arm.sensor_motion(arm, q, v, vdot, motion)
@@ -111,7 +111,7 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
     truth = np.empty(15 + n)
     v, vdot = x[half : half + n], xdot[half : half + n]
     true_sample_into(arm, phi, x[:n], v, vdot, wrench_W, truth)
-    copy_into(truth, sensor_chain.TRUE_JOINT_ANGLES.start, x, 0, n)
+    copy_into(truth, sensor_chain.TRUE_ANGLES_SLICE.start, x, 0, n)
     size = regressor.FIRST_JOINT_INDEX + n
     copy_into(memory, size, memory, 0, size)
     filters = memory[2 * size : middle], memory[middle:end]
@@ -120,7 +120,7 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
 
 @njit(cache=True)
 def append_step_to_queue(queue, time, state, surroundings):
-    """Append time and state of a step's end to `queue`, which is `tail` in `take_due_samples`."""
+    """Append the end time and end state of an integration step to the sensor's queue."""
     width = state.shape[0] + 1 + surroundings.shape[0]
     entry = queue[2 + int(queue[1]) * width :][:width]
     entry[0] = time
@@ -129,7 +129,7 @@ def append_step_to_queue(queue, time, state, surroundings):
 
 
 @njit(cache=True, omits_reference_counting=True)
-def _try_append_step(memory, queue_start, max_steps, time, state, surroundings):
+def _append_if_space(memory, queue_start, max_steps, time, state, surroundings):
     if memory[queue_start + 1] >= max_steps:
         return False
     append_step_to_queue(memory[queue_start:], time, state, surroundings)
@@ -151,9 +151,9 @@ def take_due_samples(
     """Take the samples that are due in the integration steps since the last call.
 
     Args:
-        physics: (arm's table, phi of the tool, contact pairs, sheet spring (4,): mass, stiffness,
-            damping, gravity; joint table of other moving bodies; wrenches from Drake).
-        sensor: (`sensor` of `measure_sample_into`, starts of estimator's memory and of `tail`).
+        physics: tuple of the arm's table, inertial parameters phi of the tool, pairs of shapes in
+            contact, sheet spring, joint table of other moving bodies, and wrenches from Drake.
+        sensor: (`sensor` of `measure_sample_into`, indices of estimator's memory and `tail`).
         time: present time [s], the end of a step.
         state: (2 n,) present state [q; v] of the arm.
         surroundings: [deflection and rate of the sheet, plant's state if other bodies move] now.
@@ -163,7 +163,7 @@ def take_due_samples(
             number of samples, number of queued steps, time and state of each queued step's end].
         include_now: True to include a sample at `time`.
         contact_W: (6,) contact wrench on the tool about Wo, in W; (0,): calculate by `physics`.
-        scratch: (9, m) work array, overwritten.
+        scratch: work array for nine states, overwritten.
         result: written: [last sample before now (16 + n) | its time [s] | memory].
     """
     n = state.shape[0] // 2
@@ -249,7 +249,8 @@ class WristSensor(LeafSystem):
     A force that no input contains raises a DrakeTeleopError during simulation.
 
     Args:
-        hold_time: period of changes of the motor torque, or with `ramps` of its rate [s].
+        hold_time: time between changes of the motor torque, or with `ramps` of its rate [s].
+        ramps: True if motor torques are linear in time between these changes.
     """
 
     __slots__ = NO_EXTRA_SLOTS
@@ -341,10 +342,10 @@ class WristSensor(LeafSystem):
 
     @property
     def motion_dependent_state_indices(self) -> NDArray[np.intp]:
-        """Indices of the numbers in the discrete state that depend on the motion."""
+        """Indices of the numbers of this block's discrete state that depend on the motion."""
         _, chain_end, end = self._sensor
         size = regressor.sample_size(self._n)
-        before_and_walks = range(size, 2 * size + sensor_chain.FILTER_MEMORY_START)
+        before_and_walks = range(size, 2 * size + sensor_chain.FILTER_START_INDEX)
         others = [regressor.SATURATION_FLAG_INDEX, *before_and_walks, chain_end, chain_end + 1]
         return np.delete(np.arange(end), others)
 
@@ -387,7 +388,7 @@ class WristSensor(LeafSystem):
 
     def _take_due_samples_into(self, context: Context, include_now: bool, result: Array) -> None:
         seen = self._states_of_arm_and_environment(context)
-        near, contact_W = self._classify_tool_proximity(*seen), _EMPTY_WRENCH_FOR_COMPILED_CONTACT
+        near, contact_W = self._classify_tool_proximity(*seen), _NO_GIVEN_CONTACT_WRENCH
         if include_now and near == PROXIMITY_FAR:
             contact_W = self._zero_wrench
         elif include_now and (near == PROXIMITY_NEAR_MONITORED or self._uses_plant_contact):
@@ -423,7 +424,7 @@ class WristSensor(LeafSystem):
             monitored = self._monitored_pairs.size
             if not monitored or self._classify_tool_proximity(*seen) != PROXIMITY_NEAR_MONITORED:
                 memory = discrete_state.get_mutable_value(0)
-                if _try_append_step(memory, self._sensor[2], self._max_queued_steps, time, *seen):
+                if _append_if_space(memory, self._sensor[2], self._max_queued_steps, time, *seen):
                     return
         discrete_state.set_value(0, self._step.Eval(context)[self._memory_slice])
 
@@ -479,7 +480,7 @@ def AddCompiledWristSensor(
 ) -> dict[str, OutputPort]:
     """Add the block "wrist_sensor" with its noise source; return the ports by name.
 
-    `torque` contains the ports of the joint control: `joint_torque`, and `torque_rate` if it ramps.
+    `torque` contains the joint control's ports: `joint_torque`, and `torque_rate` if torques ramp.
     """
     sensor = WristSensor(slave, config, motion, period, hold_time, ramps="torque_rate" in torque)
     builder.AddNamedSystem("wrist_sensor", sensor)
