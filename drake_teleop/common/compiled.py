@@ -25,7 +25,7 @@ from numba.extending import intrinsic
 
 from drake_teleop.common.errors import DrakeTeleopError
 
-_TYPES_IDENTIFIED_BY_REPR = (
+_CONSTANT_TYPES_HASHED_BY_REPR = (
     *(int, float, complex, str, bytes, slice, type(None), type(...)),
     *(np.dtype, np.generic),
 )
@@ -140,24 +140,24 @@ def fingerprint_of_code(dispatcher: Dispatcher) -> str:
     found: set[Any] = {dispatcher}
     pending: list[Any] = [dispatcher]
     while pending:
-        called = _fingerprint_text_and_callees(pending.pop())[1] - found
+        called = _text_for_fingerprint_and_callees(pending.pop())[1] - found
         found |= called
         pending.extend(called)
-    texts = sorted(_fingerprint_text_and_callees(each)[0] for each in found)
+    texts = sorted(_text_for_fingerprint_and_callees(each)[0] for each in found)
     return sha256("\n".join(texts).encode()).hexdigest()[:16]
 
 
 @cache
-def _fingerprint_text_and_callees(compiled: Any) -> tuple[str, frozenset[Any]]:
+def _text_for_fingerprint_and_callees(compiled: Any) -> tuple[str, frozenset[Any]]:
     function = getattr(compiled, "py_func", compiled)
     constants = dict(_values_referenced_by(function))
     options = getattr(compiled, "targetoptions", {})
     text = (
         _qualified_name(compiled),
-        _fingerprint_text(function.__code__),
-        _fingerprint_text(function.__defaults__),
+        _text_for_fingerprint(function.__code__),
+        _text_for_fingerprint(function.__defaults__),
         sorted((name, str(option)) for name, option in options.items()),
-        sorted((name, _fingerprint_text(value)) for name, value in constants.items()),
+        sorted((name, _text_for_fingerprint(value)) for name, value in constants.items()),
     )
     package = function.__module__.partition(".")[0]
     callees = (value for value in constants.values() if _is_callee(value, package))
@@ -193,19 +193,19 @@ def _names_referenced_by_code(code: CodeType) -> Iterator[str]:
             yield from _names_referenced_by_code(constant)
 
 
-def _fingerprint_text(value: Any) -> str:
+def _text_for_fingerprint(value: Any) -> str:
     if isinstance(value, CodeType):
         parts = [value.co_code, value.co_names, value.co_varnames, value.co_argcount]
         # Since Python 3.11 exception handlers are in a separate table.
         parts += [value.co_freevars, getattr(value, "co_exceptiontable", b"")]
-        return repr((parts, _fingerprint_text(value.co_consts)))
+        return repr((parts, _text_for_fingerprint(value.co_consts)))
     if isinstance(value, tuple):
-        return f"{type(value).__name__}{[_fingerprint_text(each) for each in value]}"
+        return f"{type(value).__name__}{[_text_for_fingerprint(each) for each in value]}"
     if isinstance(value, np.ndarray):
         return repr((value.dtype, value.shape, value.tobytes()))
     if isinstance(value, (Dispatcher, ModuleType)) or callable(value):
         return _qualified_name(value)
-    if isinstance(value, _TYPES_IDENTIFIED_BY_REPR):
+    if isinstance(value, _CONSTANT_TYPES_HASHED_BY_REPR):
         return repr(value)
     what = f"a cached compiled function uses {value!r}, whose changes are not detected"
     raise TypeError(f"{what}; pass it to the function as an argument")

@@ -23,7 +23,7 @@ from drake_teleop.common.registry import Registry
 
 TYPE_NAMES = {float: "a number", int: "a whole number", bool: "true or false", str: "a word"}
 """Name of each value type in messages."""
-_assignment_checks_enabled = ContextVar("checks_assignments", default=True)
+_ARE_ASSIGNMENTS_CHECKED = ContextVar("checks_assignments", default=True)
 
 
 def quantity(
@@ -256,7 +256,7 @@ def _check_value_type(kind: FieldType, value: Any, where: str, *, from_file: boo
             raise _make_type_error(TYPE_NAMES[first], value, where, remedy)
     elif from_file:
         several = len(kind.items) > 1
-        check_structure(_block_class_of_tag(kind.items, value, where), value, where, tagged=several)
+        check_structure(_class_of_yaml_tag(kind.items, value, where), value, where, tagged=several)
     elif not isinstance(value, kind.items):
         fields = ", ".join(_field_names(first))
         remedy = f"pass {first.__name__}(...) with fields {fields}"
@@ -264,7 +264,7 @@ def _check_value_type(kind: FieldType, value: Any, where: str, *, from_file: boo
         raise _make_type_error(expected, value, where, remedy)
 
 
-def _block_class_of_tag(blocks: tuple[type, ...], value: Any, where: str) -> type:
+def _class_of_yaml_tag(blocks: tuple[type, ...], value: Any, where: str) -> type:
     names = [block.__name__ for block in blocks]
     tag = str(value.get("_tag", "")).removeprefix("!") if isinstance(value, dict) else ""
     if tag and tag not in names:
@@ -379,7 +379,7 @@ def _set_checked_attribute(self: Any, name: str, value: Any) -> None:
     # Drake's `yaml_load_typed` sets an optional field to float(), list() etc. before the value of
     # the file. Such a value is checked again when a station is made.
     is_created = getattr(self, name, value) is None and not value
-    if _assignment_checks_enabled.get() and not is_created:
+    if _ARE_ASSIGNMENTS_CHECKED.get() and not is_created:
         check_field(type(self), name, value, place)
     else:
         check_field_name(type(self), name, place)
@@ -388,11 +388,11 @@ def _set_checked_attribute(self: Any, name: str, value: Any) -> None:
 
 @contextmanager
 def unchecked_assignments() -> Iterator[None]:
-    token = _assignment_checks_enabled.set(False)
+    token = _ARE_ASSIGNMENTS_CHECKED.set(False)
     try:
         yield
     finally:
-        _assignment_checks_enabled.reset(token)
+        _ARE_ASSIGNMENTS_CHECKED.reset(token)
 
 
 def fields_of(config: Any) -> list[FieldInfo]:

@@ -23,7 +23,7 @@ _MAX_LISTED_FILES = 6
 _RUST_OS_ERROR_PATTERN = re.compile(r"([^:]+) \(os error \d+\)")
 
 _LOG_PART_NAME_FORMAT = "row_{:010d}.parquet"
-LOG_PARTS_PATTERN = _LOG_PART_NAME_FORMAT.format(0).replace("0", "?")
+LOG_PARTS_GLOB = _LOG_PART_NAME_FORMAT.format(0).replace("0", "?")
 DRIVE_INPUTS_FILE_NAME = "inputs.csv"
 """Name of the file with the inputs of a recorded drive."""
 
@@ -161,7 +161,7 @@ def remove_log(path: Path) -> None:
     if not path.is_dir():
         path.unlink(missing_ok=True)
         return
-    parts = sorted(path.glob(LOG_PARTS_PATTERN))
+    parts = sorted(path.glob(LOG_PARTS_GLOB))
     if others := sorted(set(path.iterdir()) - set(parts)):
         what = f"contains {others[0].name}, which is not part of a log"
         raise DrakeTeleopError(what, where=str(path), remedy="give another folder for the log")

@@ -147,7 +147,7 @@ def find_runs_of_true(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
     return np.flatnonzero(np.diff(np.concatenate([ends, flags, ends]))).reshape(-1, 2)
 
 
-def samples_to_nearest_flag(flags: NDArray[np.bool_]) -> Array:
+def samples_to_nearest_true(flags: NDArray[np.bool_]) -> Array:
     """Return for each sample (N,) the distance in samples to the nearest True; inf without one."""
     at = np.arange(len(flags), dtype=float)
     before = np.maximum.accumulate(np.where(flags, at, -np.inf))

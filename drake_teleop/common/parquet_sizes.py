@@ -43,7 +43,7 @@ def _check_footer_and_columns(content: bytes | mmap.mmap) -> None:
     start = end - int.from_bytes(content[end : end + 4], "little")
     _require(start >= len(_PARQUET_MAGIC), "its footer is longer than the file")
     footer = _ThriftReader(content[start:end]).read_struct()
-    columns = list(_read_column_names_and_flatness(footer[2]))
+    columns = list(_read_column_names_and_flat_flags(footer[2]))
     groups = footer.get(4, [])
     rows = [_read_size(group, 3, "rows in a row group") for group in groups]
     same_rows = _read_size(footer, 3, "rows") == sum(rows)
@@ -54,7 +54,7 @@ def _check_footer_and_columns(content: bytes | mmap.mmap) -> None:
             _check_column_chunk(content, start, chunk[3], name, count if is_flat else None)
 
 
-def _read_column_names_and_flatness(schema: list[_ThriftStruct]) -> Iterator[tuple[str, bool]]:
+def _read_column_names_and_flat_flags(schema: list[_ThriftStruct]) -> Iterator[tuple[str, bool]]:
     above = [(len(schema), True)]  # of each enclosing group: remaining children, is flat
     for element in schema:
         while above[-1][0] == 0:

@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 
-NUM_COLUMNS_OF_ROTATION_FORM = {
+NUM_COLUMNS_BY_ROTATION_FORM = {
     "matrix": 9,
     "quaternion_wxyz": 4,
     "quaternion_xyzw": 4,
@@ -29,7 +29,7 @@ EULER_AXIS_SEQUENCES = tuple(
 def rotation_matrices(columns: Array, form: str, axes: str | None = None) -> Array:
     """Return rotation matrices (N, 3, 3) of `columns` (N, k) in a `form`, without normalization.
 
-    The forms are in `NUM_COLUMNS_OF_ROTATION_FORM`: matrices row by row, angles in rad. `axes` is
+    The forms are in `NUM_COLUMNS_BY_ROTATION_FORM`: matrices row by row, angles in rad. `axes` is
     one of `EULER_AXIS_SEQUENCES`.
     """
     if form == "euler":

@@ -147,7 +147,7 @@ def identify_load(
     simulation = scenario.simulation
     with show_progress(progress) as stage:
         if trajectory is None:
-            trajectory, kappa = _get_motion_and_kappa(scenario, stage)
+            trajectory, kappa = _motion_and_condition(scenario, stage)
         else:
             robot = RobotFromScenario(scenario)
             _check_given_trajectory(robot, trajectory, simulation.duration)
@@ -186,7 +186,7 @@ def identify_by_batch(
     return identify_batch(wrench, s, omega, alpha, method="total", noise=noise).identification
 
 
-def _get_motion_and_kappa(scenario: Scenario, stage: StartStage) -> tuple[FourierTrajectory, float]:
+def _motion_and_condition(scenario: Scenario, stage: StartStage) -> tuple[FourierTrajectory, float]:
     design_inputs = replace(scenario, simulation__seed=0, rates__log_hz=1.0)
     models = [path.read_bytes() for path in scenario.slave.model_files()]
     key = sha256(repr((dataclasses.asdict(design_inputs), models)).encode()).hexdigest()

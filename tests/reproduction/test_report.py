@@ -19,7 +19,7 @@ from drake_teleop.lab.reproduction.experiments import (
 from drake_teleop.lab.reproduction.report import (
     Comparison,
     compare_with_paper,
-    describe_unaccepted,
+    describe_values_outside_ranges,
     figure_captions,
     parameter_rows,
     write_report,
@@ -124,7 +124,7 @@ def test_each_wrong_value_changes_only_its_own_verdict(name, value, what, verdic
     for full, number in wrong.items():
         part, _, short = full.partition(".")
         nested.setdefault(part, {})[short] = number
-    (line,) = describe_unaccepted(nested)
+    (line,) = describe_values_outside_ranges(nested)
     assert line.startswith(row.quantity) and line.endswith(verdict)
 
 

@@ -29,7 +29,7 @@ from drake_teleop.lab.reproduction.experiments import (
 )
 from drake_teleop.lab.reproduction.report import (
     compare_with_paper,
-    describe_unaccepted,
+    describe_values_outside_ranges,
     values_by_full_name,
 )
 from drake_teleop.load.compensation import contact_wrench
@@ -139,7 +139,7 @@ def test_the_speed_was_measured(run):
 
 @pytest.mark.slow
 def test_all_rows_are_accepted(run):
-    assert describe_unaccepted(run[0]) == []
+    assert describe_values_outside_ranges(run[0]) == []
 
 
 @pytest.mark.slow

@@ -50,9 +50,9 @@ _OUTPUT_PORTS = ("operator_wrench", "pose_command", "wrench_B", "twist_master", 
 
 # Difference steps: truncation error grows with their square, rounding error with their inverse.
 _ANGLE_STEP, _RATE_STEP, _LINEAR_STATE_STEP = 1e-4, 1e-4, 1.0
-_WRENCH_DIFFERENCE_STEPS = np.repeat([1.0, 0.02], 3)  # N, N m: within the device's range
+_WRENCH_STEPS_N_NM = np.repeat([1.0, 0.02], 3)  # N, N m: within the device's range
 _MAX_ACCELERATION_OF_COMMAND_STEP_RAD_S2 = 20.0  # of a joint: within the motors' torque
-_MAX_JOINT_DIFFERENCE_STEP_IN_CONTACT = 1e-6  # rad, m: much less than the indentation by 1 N
+_MAX_JOINT_DIFFERENCE_STEP_IN_CONTACT_RAD = 1e-6  # rad, m: much less than the indentation by 1 N
 _MAX_RELATIVE_STATE_CHANGE_AT_REST = 1e-6  # change in one period over difference step
 _MAX_EQUILIBRIUM_NEWTON_STEPS = 8
 _TIME_TO_OPERATING_POINT_S, _TIME_AT_OPERATING_POINT_S = 0.3, 0.1  # motion, then rest
@@ -194,7 +194,7 @@ class _PeriodSimulator:
         self._command_step = min(_ANGLE_STEP, _MAX_ACCELERATION_OF_COMMAND_STEP_RAD_S2 / gain)
         self._joint_step = self._command_step
         if smooth.surroundings is not None:
-            self._joint_step = min(self._command_step, _MAX_JOINT_DIFFERENCE_STEP_IN_CONTACT)
+            self._joint_step = min(self._command_step, _MAX_JOINT_DIFFERENCE_STEP_IN_CONTACT_RAD)
         hand = smooth.operator.hand
         self._device = smooth.master.device(hand.mass, hand.inertia)
         self._groups = self._make_state_groups()
@@ -373,7 +373,7 @@ class _PeriodSimulator:
             return self._simulate_period_and_get_state()
 
         pose, tool = np.full(6, self._command_step), np.full(6, _LINEAR_STATE_STEP)
-        steps = np.concatenate([_WRENCH_DIFFERENCE_STEPS, pose, _WRENCH_DIFFERENCE_STEPS, tool])
+        steps = np.concatenate([_WRENCH_STEPS_N_NM, pose, _WRENCH_STEPS_N_NM, tool])
         return _central_difference_jacobian(end_state, steps)
 
 

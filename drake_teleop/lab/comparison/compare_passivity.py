@@ -47,7 +47,7 @@ SIGMAS = (0.0, 1.0)
 _NUM_TAPS, _TAP_AMPLITUDE_ABOUT_WALL_M = 8, 0.03  # number; m, amplitude about the wall's surface
 _INJECTED_ENERGY_STUDY_CASES = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
 #: Rates of every run: a quarter (sensor) or half of those of the shipped scenarios.
-_COMPARISON_RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
+_SAMPLE_RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
 #: Step [s], longer than the events' period; else tiny steps (rounding) precede the events.
 _MAX_SIMULATION_STEP_S = 2e-3
 
@@ -131,7 +131,7 @@ def compare_command(
     return summary
 
 
-def longest_round_trip(
+def longest_stable_round_trip(
     method: str, model: OneDof, jitter: float, loss: float, seeds: Sequence[int]
 ) -> float:
     """Return the longest of `ROUND_TRIPS_S` [s] up to which all runs are stable; 0: none.
@@ -156,7 +156,7 @@ def base_scenario(scenario: str | Path, seed: int) -> Scenario:
     return replace(
         given,
         simulation=Simulation(seed=seed, max_step=_MAX_SIMULATION_STEP_S),
-        rates=_COMPARISON_RATES,
+        rates=_SAMPLE_RATES,
         contact_detection=None,
         load_estimator=LoadEstimatorConfig(),  # contact would count as load
     )
@@ -280,12 +280,12 @@ def _run_longest_round_trip_study(
     product = itertools.product(methods, WALL_STIFFNESSES_N_M, JITTER_AND_LOSS_PAIRS)
     cases = [(method, wall, *pair) for method, wall, pair in product]
     # Compile here once, so that the parallel processes read the cache.
-    longest_round_trip(methods[0], OneDof(), 0.0, 0.0, [seed])
+    longest_stable_round_trip(methods[0], OneDof(), 0.0, 0.0, [seed])
     for method in methods:
         step_addresses(method)
     seeds = [seed, seed + 1]
     runs = [(method, OneDof(wall_stiffness=wall), *pair, seeds) for method, wall, *pair in cases]
-    found = _run_in_processes(longest_round_trip, runs, jobs, stage("One degree of freedom"))
+    found = _run_in_processes(longest_stable_round_trip, runs, jobs, stage("One degree of freedom"))
     names, grid = ("method", "wall_N_per_m", "jitter", "loss"), list(ROUND_TRIPS_S)
     return [
         dict(zip(names, case, strict=True)) | {"longest_s": longest, "grid_s": grid}

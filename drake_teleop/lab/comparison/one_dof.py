@@ -278,8 +278,8 @@ def measures_of_traces(
     rest = window_slice(task.end - task.rest_window, task.end)
     swing = window_slice(task.swing_start, task.swing_end)
     parts, angles = (hold, rest), () if turned is None else turned.T
-    hunting = max(_range_about_parabola(x[part]) for x in (master, slave) for part in parts)
-    turning = max((_range_about_parabola(x[part]) for x in angles for part in parts), default=0.0)
+    hunting = max(_peak_to_peak_of_rest(x[part]) for x in (master, slave) for part in parts)
+    turning = max((_peak_to_peak_of_rest(x[part]) for x in angles for part in parts), default=0.0)
     steady, goal = float(hand_force[hold].mean()), float(pressed[hold].mean())
     after = min(round((task.release_end + 2.0) / dt), len(t) - 1)
     start = round(task.press_start / dt)
@@ -318,7 +318,7 @@ def _displayed_impedance_real_part(model: OneDof, round_trip: float) -> Array:
     return np.asarray(displayed.real)
 
 
-def _range_about_parabola(x: Array) -> float:
+def _peak_to_peak_of_rest(x: Array) -> float:
     if not np.isfinite(x).all():
         return float("inf")
     t = np.linspace(-1.0, 1.0, len(x))

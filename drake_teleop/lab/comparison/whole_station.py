@@ -170,7 +170,7 @@ def station_energies(result: SimulationResult, scenario: Scenario) -> Array:
         force, torque = np.split(result["true_contact_wrench_W"], 2, axis=1)
         contact = np.hstack([force, torque - np.cross(poses[:, 4:], force)])
     gamma = scenario.force_scaling.scales().gamma
-    power = scenario.force_scaling.force_scale * gamma / _kinematic_scales_with_1_for_0(scenario)
+    power = scenario.force_scaling.force_scale * gamma / _nonzero_kinematic_scales(scenario)
     rates = scenario.rates
     energies = np.empty((len(t), 4, 2))
     # A row contains the torque of the period before the row.
@@ -208,7 +208,7 @@ def work_of_displayed_load_wrench(result: SimulationResult, scenario: Scenario) 
     wrench = -non_contact_wrench(motion[:, :3], motion[:, 3:6], motion[:, 6:9], kept)
     wrench -= non_contact_wrench(-gravity, rest, rest, excess)
     at_So = (R_WS @ wrench.reshape(-1, 2, 3, 1)).reshape(-1, 6)
-    power = scenario.force_scaling.force_scale / _kinematic_scales_with_1_for_0(scenario)
+    power = scenario.force_scaling.force_scale / _nonzero_kinematic_scales(scenario)
     return np.asarray(power * port_work(at_So, poses, "mean"))
 
 
@@ -217,14 +217,14 @@ def start_energy(scenario: Scenario) -> Array:
 
     Columns: translation, rotation.
     """
-    scales = _kinematic_scales_with_1_for_0(scenario)
+    scales = _nonzero_kinematic_scales(scenario)
     power = scenario.force_scaling.force_scale / scales
     p = methods.method_parameters(scenario.passivity, list(power), list(scales))
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     return 2 * methods.initial_method_memory(scenario.passivity.method, p, pose)[STORED_ENERGY]
 
 
-def _kinematic_scales_with_1_for_0(scenario: Scenario) -> Array:
+def _nonzero_kinematic_scales(scenario: Scenario) -> Array:
     scales = scenario.kinematic_scaling.scales
     return np.where(scales > 0.0, scales, 1.0)
 

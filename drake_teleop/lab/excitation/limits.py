@@ -13,12 +13,12 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import dot, minus, plus, scale_vector, vector_at
 from drake_teleop.lab.excitation.criteria import write_gradients_by_motion
 from drake_teleop.lab.excitation.link_gradients import (
-    ADJOINT_SEED_SIZE,
-    add_point_to_seed,
-    add_torque_to_seeds,
-    add_vector_to_seed,
-    add_wrench_to_seed,
-    pull_back_seeds,
+    ADJOINT_SIZE,
+    add_point_to_adjoint,
+    add_torque_to_adjoints,
+    add_vector_to_adjoint,
+    add_wrench_to_adjoint,
+    pull_back_adjoints,
     rotate_to_link,
     rotate_to_world,
 )
@@ -28,9 +28,9 @@ from drake_teleop.station.slave.arm import SENSOR_MOTION_SIZE, inverse_dynamics,
 LIMIT_NAMES = ("position", "velocity", "acceleration", "torque", "sensor", "workspace", "clearance")
 
 #: Distance beyond the clearance at which the use of the clearance is 0 [m].
-ZERO_USE_CLEARANCE_MARGIN_M = 0.1
-_MIN_SMOOTH_MAXIMUM_WEIGHT = 1e-7  # smaller weights in a smooth maximum's gradient are skipped
-_FAR_CAPSULE_SUBSTITUTE_DISTANCE_M = 1.0  # replaces distances with zero clearance use [m]
+CLEARANCE_USE_RANGE_M = 0.1
+_NEGLIGIBLE_GRADIENT_WEIGHT = 1e-7  # smaller weights in a smooth maximum's gradient are skipped
+_DISTANCE_OF_FAR_CAPSULES_M = 1.0  # replaces distances with zero clearance use [m]
 
 
 class Limits(NamedTuple):
@@ -104,8 +104,8 @@ def add_gradient_by_joints(table, motions, qd, qdd, g_V, gradient):
         )
         seed[:] = 0.0
         for k in range(3):
-            add_vector_to_seed(motion, 3 * k, vector_at(g[k], 0), seed)
-        _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, buffers)
+            add_vector_to_adjoint(motion, 3 * k, vector_at(g[k], 0), seed)
+        _add_joint_gradients_at_sample(table, qd, qdd, motions, t, gradient, buffers)
 
 
 @njit(cache=True)
@@ -148,15 +148,15 @@ def _exact_and_smooth_maximum(use, sharpness):
 
 @njit(cache=True)
 def _allocate_gradient_buffers(motions):
-    # Seeds, joint velocities and link velocities of virtual power, see `add_torque_to_seeds`.
+    # Seeds, joint velocities and link velocities of virtual power, see `add_torque_to_adjoints`.
     rows = motions.shape[1]
-    return np.zeros((rows, ADJOINT_SEED_SIZE)), np.zeros(rows - 1), np.zeros((rows, 6))
+    return np.zeros((rows, ADJOINT_SIZE)), np.zeros(rows - 1), np.zeros((rows, 6))
 
 
 @njit(cache=True)
-def _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, buffers):
+def _add_joint_gradients_at_sample(table, qd, qdd, motions, t, gradient, buffers):
     seeds, c, virtual = buffers
-    pull_back_seeds(
+    pull_back_adjoints(
         table, motions[t], qd[t], qdd[t], c, virtual, seeds,
         gradient[0, t], gradient[1, t], gradient[2, t],
     )  # fmt: skip
@@ -173,15 +173,15 @@ def _max_torque_use_into(samples, limits, sharpness, gradient):
     buffers = _allocate_gradient_buffers(motions)
     seeds, c, virtual = buffers
     for t in range(len(q)):
-        if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
+        if use[t].max() < _NEGLIGIBLE_GRADIENT_WEIGHT:
             continue
         seeds[:] = 0.0
         c[:] = use[t] * np.sign(tau[t]) / limits.max_torques
         # Table columns 22 and 23: rotor inertia and joint damping.
         gradient[2, t] += c * table[:-1, 22]
         gradient[1, t] += c * table[:-1, 23]
-        add_torque_to_seeds(table, motions[t], c, virtual, seeds)
-        _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, buffers)
+        add_torque_to_adjoints(table, motions[t], c, virtual, seeds)
+        _add_joint_gradients_at_sample(table, qd, qdd, motions, t, gradient, buffers)
     return maxima
 
 
@@ -202,17 +202,17 @@ def _max_sensor_use_into(samples, limits, sharpness, gradient):
     buffers = _allocate_gradient_buffers(motions)
     seed = buffers[0][-1]
     for t in range(len(motions)):
-        if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
+        if use[t].max() < _NEGLIGIBLE_GRADIENT_WEIGHT:
             continue
         seed[:] = 0.0
         motion, g = motions[t, -1], x[t]
         for k in range(4):
             size_limit = limits.max_sensor_norms[k] * max(size[t, k], 1e-12)
             g[3 * k : 3 * k + 3] *= use[t, k] / size_limit
-        add_wrench_to_seed(motion, limits.heaviest_phi, vector_at(g, 0), vector_at(g, 3), seed)
-        add_vector_to_seed(motion, 0, vector_at(g, 6), seed)
-        add_vector_to_seed(motion, 6, vector_at(g, 9), seed)
-        _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, buffers)
+        add_wrench_to_adjoint(motion, limits.heaviest_phi, vector_at(g, 0), vector_at(g, 3), seed)
+        add_vector_to_adjoint(motion, 0, vector_at(g, 6), seed)
+        add_vector_to_adjoint(motion, 6, vector_at(g, 9), seed)
+        _add_joint_gradients_at_sample(table, qd, qdd, motions, t, gradient, buffers)
     return maxima
 
 
@@ -231,12 +231,12 @@ def _max_workspace_use_into(samples, limits, sharpness, gradient):
     buffers = _allocate_gradient_buffers(motions)
     seed = buffers[0][-1]
     for t in range(T):
-        if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
+        if use[t].max() < _NEGLIGIBLE_GRADIENT_WEIGHT:
             continue
         seed[:] = 0.0
         for k in range(P):
-            add_point_to_seed(motions[t, -1], limits.points_S[k], vector_at(by_x[t, k], 0), seed)
-        _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, buffers)
+            add_point_to_adjoint(motions[t, -1], limits.points_S[k], vector_at(by_x[t, k], 0), seed)
+        _add_joint_gradients_at_sample(table, qd, qdd, motions, t, gradient, buffers)
     return maxima
 
 
@@ -250,31 +250,31 @@ def _max_clearance_use_into(samples, limits, sharpness, gradient):
         for k in range(K):
             a, b = limits.capsule_pairs[k]
             reach = limits.capsule_radius[a] + limits.capsule_radius[b]
-            distance, far = _FAR_CAPSULE_SUBSTITUTE_DISTANCE_M, reach + ZERO_USE_CLEARANCE_MARGIN_M
+            distance, far = _DISTANCE_OF_FAR_CAPSULES_M, reach + CLEARANCE_USE_RANGE_M
             if not _are_segments_surely_apart(ends[t, a], ends[t, b], far):
                 distance = _nearest_points_of_segments(ends[t, a], ends[t, b])[0] - reach
             excess = distance - limits.min_pair_distances[k]
-            use[t, k] = 1.0 - excess / ZERO_USE_CLEARANCE_MARGIN_M
+            use[t, k] = 1.0 - excess / CLEARANCE_USE_RANGE_M
     maxima = _exact_and_smooth_maximum(use, sharpness)
     buffers = _allocate_gradient_buffers(motions)
     seeds = buffers[0]
     for t in range(T):
-        if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
+        if use[t].max() < _NEGLIGIBLE_GRADIENT_WEIGHT:
             continue
         seeds[:] = 0.0
         for k in range(K):
-            if use[t, k] < _MIN_SMOOTH_MAXIMUM_WEIGHT:
+            if use[t, k] < _NEGLIGIBLE_GRADIENT_WEIGHT:
                 continue
             a, b = limits.capsule_pairs[k]
             _, on_a, on_b, towards_a = _nearest_points_of_segments(ends[t, a], ends[t, b])
-            g = scale_vector(-use[t, k] / ZERO_USE_CLEARANCE_MARGIN_M, towards_a)
+            g = scale_vector(-use[t, k] / CLEARANCE_USE_RANGE_M, towards_a)
             for capsule, share, sign in ((a, on_a, 1.0), (b, on_b, -1.0)):
                 row = limits.capsule_links[capsule]
                 if row >= 0:
                     start, along = _start_and_direction(limits.capsule_ends[capsule])
                     point = plus(start, scale_vector(share, along))
-                    add_point_to_seed(motions[t, row], point, scale_vector(sign, g), seeds[row])
-        _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, buffers)
+                    add_point_to_adjoint(motions[t, row], point, scale_vector(sign, g), seeds[row])
+        _add_joint_gradients_at_sample(table, qd, qdd, motions, t, gradient, buffers)
     return maxima
 
 

@@ -28,7 +28,7 @@ from drake_teleop.station.station import GetBlock, MakeTeleopStation
 NamedValues = dict[str, Any]
 
 SIGMAS = (1.0, 0.5, 0.0)
-_CONTACT_THRESHOLD_OVER_FREE_PEAK_FORCE = 1.5
+_CONTACT_THRESHOLD_TO_FREE_PEAK_RATIO = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class RunsWithAndWithoutContact:
     def threshold_N(self) -> float:
         """Force threshold of the contact detection [N]."""
         free_force = self.free.scaled_wrenches[0.0][:, :3]
-        return _CONTACT_THRESHOLD_OVER_FREE_PEAK_FORCE * _largest_norm(free_force)
+        return _CONTACT_THRESHOLD_TO_FREE_PEAK_RATIO * _largest_norm(free_force)
 
 
 def simulate_motion(scenario: Scenario, estimate: Array, progress: UpdateProgress) -> MotionRun:

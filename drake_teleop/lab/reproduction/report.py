@@ -121,7 +121,7 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
     ]  # fmt: skip
 
 
-def describe_unaccepted(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
+def describe_values_outside_ranges(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Return a text for each reproduced value that is outside its accepted range."""
     return [
         f"{row.quantity}: {row.reproduced_value} (accepted: {row.accepted_range}): {row.verdict}"

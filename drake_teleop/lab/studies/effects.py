@@ -257,7 +257,7 @@ class _MeasureEffectModel:
                 found = [*self.model.means(self.table, weights), effects[factor], halves[factor]]
                 figures[:, is_compared] = found
         runs = np.bincount(levels.index, self.runs, count).astype(np.int64)
-        reasons_and_counts = self._summarise_coverage(is_compared, levels.index, used, factor)
+        reasons_and_counts = self._reasons_and_counts(is_compared, levels.index, used, factor)
         return MainEffect(levels.names, runs, mean, half, effect, effect_half, *reasons_and_counts)
 
     def pair_means(self, first: int, second: int) -> PairMeans | None:
@@ -272,12 +272,12 @@ class _MeasureEffectModel:
         cell = a.index * shape[1] + b.index
         is_compared &= np.bincount(cell, self.runs, len(is_compared)) > 0
         mean[~is_compared] = np.nan
-        why, used, unused, fitted = self._summarise_coverage(is_compared, cell, over, first, second)
+        why, used, unused, fitted = self._reasons_and_counts(is_compared, cell, over, first, second)
         fields, names = (self.factors[first].field, self.factors[second].field), (a.names, b.names)
         reasons = np.array(why).reshape(shape)
         return PairMeans(fields, names, mean.reshape(shape), reasons, used, unused, fitted)
 
-    def _summarise_coverage(
+    def _reasons_and_counts(
         self, compared: BooleanArray, cell: NDArray[np.int64], used: BooleanArray, *factors: int
     ) -> tuple[list[str], int, int, bool]:
         # The last four fields of `MainEffect`; `used` flags combinations.

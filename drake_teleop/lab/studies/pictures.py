@@ -25,9 +25,9 @@ from drake_teleop.lab.studies.effects import (
 )
 from drake_teleop.lab.studies.level_model import (
     CONFIDENCE_LEVEL,
+    INCOMPARABLE,
     NO_RUN,
     NO_SUCCESS,
-    NOT_COMPARABLE,
     TOO_FEW_POINTS,
 )
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 _MAX_UNROTATED_LABEL_LETTERS = 24  # letters that fit below a picture
 # Hatches of cells without value.
-_HATCH_BY_REASON = {NO_SUCCESS: "////", NO_RUN: "....", NOT_COMPARABLE: "xxxx", TOO_FEW_POINTS: ""}
+_HATCH_BY_REASON = {NO_SUCCESS: "////", NO_RUN: "....", INCOMPARABLE: "xxxx", TOO_FEW_POINTS: ""}
 
 
 def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:

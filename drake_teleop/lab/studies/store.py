@@ -74,7 +74,7 @@ class Store:
     def clear_start_count_of_chunk(self, first_run: int) -> None:
         (self._run_start_counts_folder / str(first_run)).unlink(missing_ok=True)
 
-    def first_runs_of_chunks_started_at_least(self, times: int) -> set[int]:
+    def first_runs_of_chunks_by_min_starts(self, times: int) -> set[int]:
         marks = (mark for mark in self._run_start_counts_folder.glob("*") if mark.name.isdecimal())
         return {int(mark.name) for mark in marks if mark.stat().st_size >= times}
 
