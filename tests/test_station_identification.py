@@ -51,7 +51,7 @@ def test_motion_is_designed_once_for_all_seeds_and_again_for_another_sensor(monk
 
     def designed(**changes) -> float:
         scenario = replace(LoadScenario("identification"), **changes)
-        trajectory, _ = identification._motion_and_condition(scenario, lambda _: None)
+        trajectory, _ = identification._get_motion_and_kappa(scenario, lambda _: None)
         trajectory.rho[1:] = 99.0  # callers may change their copy
         return trajectory.rho[0, 0]
 

@@ -34,7 +34,7 @@ _CONSTANT_TYPES_HASHED_BY_REPR = (
 def njit(*, omits_reference_counting: bool = False, **options: Any) -> Callable[[Any], Any]:
     """Return a decorator like `numba.njit`; with `cache=True` it stores the machine code on disk.
 
-    With `omits_reference_counting` the function must create no arrays.
+    `omits_reference_counting` gives faster code, but the function must create no arrays.
     """
     # Set in either case, because callees inherit unset options.
     options["_nrt"] = not omits_reference_counting
@@ -53,11 +53,11 @@ def njit(*, omits_reference_counting: bool = False, **options: Any) -> Callable[
 
 
 def make_call_at_address(arguments: tuple[types.Type, ...]) -> Any:
-    """Return a compiled f(address, values) that calls machine code with these argument types."""
+    """Return a compiled function of the address and arguments of machine code, which it calls."""
 
     @intrinsic
     def call(_typing_context: Any, _address: Any, *_arguments: Any) -> Any:
-        def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        def generate_code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
             address, packed = values
             pairs = zip(cgutils.unpack_tuple(builder, packed), signature.args[1], strict=True)
             cast = [
@@ -73,7 +73,7 @@ def make_call_at_address(arguments: tuple[types.Type, ...]) -> Any:
                 context.call_conv.return_status_propagate(builder, status)
             return context.get_dummy_value()
 
-        return types.void(types.int64, types.StarArgTuple(_arguments)), code
+        return types.void(types.int64, types.StarArgTuple(_arguments)), generate_code
 
     call.__qualname__ = f"call_at{arguments}"  # part of the caller's fingerprint
     return call
@@ -207,8 +207,8 @@ def _text_for_fingerprint(value: Any) -> str:
         return _qualified_name(value)
     if isinstance(value, _CONSTANT_TYPES_HASHED_BY_REPR):
         return repr(value)
-    what = f"a cached compiled function uses {value!r}, whose changes are not detected"
-    raise TypeError(f"{what}; pass it to the function as an argument")
+    what = f"a cached compiled function uses {value!r}"
+    raise TypeError(f"{what}, whose changes are not detected; pass this value as an argument")
 
 
 def _qualified_name(value: Any) -> str:

@@ -29,10 +29,10 @@ _ARE_ASSIGNMENTS_CHECKED = ContextVar("checks_assignments", default=True)
 def quantity(
     default: Any, unit: str, low: float, high: float, doc: str, *, length: int | None = None
 ) -> Any:
-    """Return a dataclass field for a number, or for a list or mapping of numbers, as `default` is.
+    """Return a dataclass field for a number, list or mapping of numbers, like its default.
 
     `unit` is an SI unit, "1" if dimensionless; each number must be from `low` to `high`. A list
-    has the length of its default; after [] any length; after None `length`.
+    has the length of its default. Default [] allows any length, default None `length` numbers.
     """
     metadata = {"unit": unit, "low": low, "high": high, "doc": doc, "length": length}
     if isinstance(default, list) and default:
@@ -67,7 +67,7 @@ def plain(
 def with_absolute_paths(config: Any, folder: Path) -> Any:
     """Return a copy of a dataclass whose paths, relative to `folder`, are absolute, at any depth.
 
-    A default path is a shipped model; it changes only if `folder` contains such a file.
+    Default paths of shipped models remain, unless `folder` contains a file of this name.
     """
 
     def resolve_paths(value: Any, entry: dataclasses.Field[Any]) -> Any:
@@ -100,7 +100,7 @@ def shorten_value(value: Any) -> str:
 def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False) -> None:
     """Raise DrakeTeleopError if parsed YAML does not fit the fields and types of a dataclass.
 
-    `tagged` allows the key "_tag" with a YAML tag.
+    `where` is the place in messages; `tagged` allows a YAML tag, as the key "_tag".
     """
     if not isinstance(data, dict):
         what = f"expected a mapping of fields, found {shorten_value(data)}"
@@ -208,9 +208,9 @@ def _field_names(schema: type) -> list[str]:
 
 
 class FieldType(NamedTuple):
-    """Structure of a type: for `list[A | B] | None`, depth 1, items A and B, optional True.
+    """Parsed type hint: `list[A | B] | None` has list depth 1, items (A, B) and is optional.
 
-    `is_mapping` is True for `dict[str, A]`, a mapping of names to items.
+    `is_mapping` is True for `dict[str, A]`.
     """
 
     list_depth: int
@@ -239,7 +239,7 @@ def _check_value_type(kind: FieldType, value: Any, where: str, *, from_file: boo
         return
     if kind.is_mapping:
         if not isinstance(value, dict) or "_tag" in value:
-            raise _make_type_error("a mapping of names", value, where, "write {name: value}")
+            raise _make_type_error("names with values", value, where, "write {name: value}")
         for name, item in value.items():
             inner = kind._replace(is_mapping=False)
             _check_value_type(inner, item, f"{where}.{name}", from_file=from_file)

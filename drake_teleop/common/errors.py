@@ -44,7 +44,7 @@ def to_one_line(text: str, max_length: int = MAX_ERROR_LINE_LENGTH) -> str:
 
 
 def expect_type(kind: type | tuple[type, ...], value: Any, where: str, remedy: str = "") -> None:
-    """Raise DrakeTeleopError for argument `where` unless the value has type `kind`."""
+    """Raise DrakeTeleopError unless the value of the argument named `where` has type `kind`."""
     if not isinstance(value, kind):
         kinds = kind if isinstance(kind, tuple) else (kind,)
         expected = " or ".join("None" if one is type(None) else one.__name__ for one in kinds)

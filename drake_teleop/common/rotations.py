@@ -27,10 +27,10 @@ EULER_AXIS_SEQUENCES = tuple(
 
 
 def rotation_matrices(columns: Array, form: str, axes: str | None = None) -> Array:
-    """Return rotation matrices (N, 3, 3) of `columns` (N, k) in a `form`, without normalization.
+    """Return rotation matrices (N, 3, 3) of table columns (N, k), without normalization.
 
-    The forms are in `NUM_COLUMNS_BY_ROTATION_FORM`: matrices row by row, angles in rad. `axes` is
-    one of `EULER_AXIS_SEQUENCES`.
+    `form` is a key of `NUM_COLUMNS_BY_ROTATION_FORM`: matrices row by row, angles in rad. The form
+    "euler" needs `axes`, such as "xyz" (fixed) or "XYZ" (moving).
     """
     if form == "euler":
         from scipy.spatial.transform import Rotation

@@ -147,7 +147,7 @@ def identify_load(
     simulation = scenario.simulation
     with show_progress(progress) as stage:
         if trajectory is None:
-            trajectory, kappa = _motion_and_condition(scenario, stage)
+            trajectory, kappa = _get_motion_and_kappa(scenario, stage)
         else:
             robot = RobotFromScenario(scenario)
             _check_given_trajectory(robot, trajectory, simulation.duration)
@@ -186,7 +186,7 @@ def identify_by_batch(
     return identify_batch(wrench, s, omega, alpha, method="total", noise=noise).identification
 
 
-def _motion_and_condition(scenario: Scenario, stage: StartStage) -> tuple[FourierTrajectory, float]:
+def _get_motion_and_kappa(scenario: Scenario, stage: StartStage) -> tuple[FourierTrajectory, float]:
     design_inputs = replace(scenario, simulation__seed=0, rates__log_hz=1.0)
     models = [path.read_bytes() for path in scenario.slave.model_files()]
     key = sha256(repr((dataclasses.asdict(design_inputs), models)).encode()).hexdigest()
@@ -201,7 +201,7 @@ def _motion_and_condition(scenario: Scenario, stage: StartStage) -> tuple[Fourie
 def _check_given_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: float) -> None:
     if len(trajectory.q0) != robot.arm.num_joints:
         what = f"has {len(trajectory.q0)} joints, but the arm has {robot.arm.num_joints}"
-        raise DrakeTeleopError(what, where="trajectory", remedy="compute a trajectory for this arm")
+        raise DrakeTeleopError(what, where="trajectory", remedy="run excite for this arm")
     if not np.isclose(trajectory.period, duration, rtol=1e-9):
         what = f"has a period of {trajectory.period:g} s, but the simulation lasts {duration:g} s"
         remedy = "set simulation.duration to the period"

@@ -242,7 +242,7 @@ def is_in_contact(result: SimulationResult) -> NDArray[np.bool_]:
     if "true_contact_wrench_W" not in result:
         return np.zeros(len(result.t), dtype=bool)
     touch = np.any(result["true_contact_wrench_W"] != 0, axis=1)
-    return _after_contact_s(touch, result.t) + _until_contact_s(touch, result.t) < FILTER_SETTLING_S
+    return _since_contact_s(touch, result.t) + _until_contact_s(touch, result.t) < FILTER_SETTLING_S
 
 
 def summarise(run: ScenarioRun) -> dict[str, Any]:
@@ -255,7 +255,7 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
     calculated = contact_wrench(wrench, estimate[:6], s, omega, alpha, estimate[6:])
     contact = is_in_contact(result)
     # The first bounce of a contact may be between two samples.
-    free = _after_contact_s(contact, result.t) > FILTER_SETTLING_S
+    free = _since_contact_s(contact, result.t) > FILTER_SETTLING_S
     free &= _until_contact_s(contact, result.t) > FILTER_SETTLING_S
     mass, com = _mass_and_com(estimate[6:])
     true_mass, true_com = _mass_and_com(arm.phi_load)
@@ -338,13 +338,13 @@ def _peak_force_torque_by_name(prefix: str, suffix: str, wrench: Array) -> dict[
     return {name: float(norm) for name, norm in zip(names, norms, strict=True)}
 
 
-def _after_contact_s(contact: NDArray[np.bool_], t: Array) -> Array:
+def _since_contact_s(contact: NDArray[np.bool_], t: Array) -> Array:
     last = np.maximum.accumulate(np.where(contact, np.arange(len(t)), -1))
     return np.where(last < 0, np.inf, t - t[last])
 
 
 def _until_contact_s(contact: NDArray[np.bool_], t: Array) -> Array:
-    return _after_contact_s(contact[::-1], -t[::-1])[::-1]
+    return _since_contact_s(contact[::-1], -t[::-1])[::-1]
 
 
 def _mass_and_com(phi: Array) -> tuple[float, Array]:

@@ -67,10 +67,10 @@ def test_only_found_and_reported_values_agree():
     assert set(verdicts.values()) == {"agrees", "as set", "within our bound", "for the record"}
     assert [row.quantity for row in rows if row.verdict == "agrees"] == [
         "Fig. 6: largest residual force, σ = 0",
-        "Fig. 8: detection delay in the contact force",
-        "Fig. 8: a threshold on the raw force detects contact",
-        "Fig. 8: false alarm at about 600 ms",
-        "Fig. 8: contact peak over inertial peak",
+        "Fig. 8: delay from contact to detection",
+        "Fig. 8: raw force exceeds its free range",
+        "Fig. 8: contact force false alarm, 600 ms",
+        "Fig. 8: contact / inertial peak force",
     ]
     assert {row.set_or_found for row in rows if row.verdict == "agrees"} == {"found"}
     assert {row.set_or_found for row in rows if row.verdict == "as set"} == {"set"}

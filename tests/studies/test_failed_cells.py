@@ -22,9 +22,9 @@ from drake_teleop.lab.studies.effects import (
     pair_means,
 )
 from drake_teleop.lab.studies.level_model import (
-    INCOMPARABLE,
     NO_RUN,
     NO_SUCCESS,
+    NOT_COMPARABLE,
     fit_level_model,
     largest_complete_block,
     missing_value_reasons,
@@ -125,7 +125,7 @@ def test_largest_comparable_set_of_levels_is_used():
     assert rows.tolist() == [True, True, False] and columns.tolist() == [True, True, False, False]
     runs, good = np.array([3, 3, 0, 3]), np.array([2, 0, 0, 1])
     compared = np.array([True, False, False, False])
-    assert missing_value_reasons(compared, runs, good) == ["", NO_SUCCESS, NO_RUN, INCOMPARABLE]
+    assert missing_value_reasons(compared, runs, good) == ["", NO_SUCCESS, NO_RUN, NOT_COMPARABLE]
 
 
 def test_levels_that_never_meet_are_not_compared():
@@ -142,7 +142,7 @@ def test_levels_that_never_meet_are_not_compared():
         and found.num_used_combinations == 0
         and found.num_unused_combinations == 3
     )
-    assert found.missing_reasons == [INCOMPARABLE] * 2
+    assert found.missing_reasons == [NOT_COMPARABLE] * 2
 
 
 def test_intervals_hold_where_some_seeds_of_a_point_are_missing():

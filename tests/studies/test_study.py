@@ -673,7 +673,7 @@ def test_fields_of_the_scenarios_own_task_can_be_factors(
             ("values: [0, 0.5, 1]", "low: -1e308, high: 1e308"),
             "factors[0]: the value or range inf",
         ),
-        (("[0, 0.5, 1]", "[1, 1]"), "factors[0]: repeats the value 1.0"),
+        (("[0, 0.5, 1]", "[1, 1]"), "factors[0]: lists 1.0 twice"),
         (("operator.grip, words: [light, firm]", "force_scaling.sigma, values: [1]"), "twice"),
         (
             ("force_scaling.sigma", "simulation.seed"),
@@ -739,7 +739,7 @@ def test_many_runs_require_consent(files, tmp_path, monkeypatch):
     path.write_text(MANY.replace("LEVELS", "501"))
     with pytest.raises(
         DrakeTeleopError,
-        match=r"many\.yaml: 100,200 runs require a confirmation; confirm them by --yes",
+        match=r"many\.yaml: 100,200 runs need your consent; confirm them by --yes",
     ):
         study_command(path, out)
     with pytest.raises(DrakeTeleopError, match="--yes"):

@@ -146,7 +146,7 @@ def draw_absolute_stability(curves: ReportCurves) -> Figure:
         figure = Picture(figsize=(9.0, 3.6))
         left, right = figure.subplots(1, 2)
         left.semilogx(hertz, absolute_stability.llewellyn_parameter(curves.H), color=COLOURS[0])
-        left.set(ylim=(-1.2, 5.0), title="Llewellyn's parameter: absolutely stable from 1 on")
+        left.set(ylim=(-1.2, 5.0), title="Llewellyn's parameter (absolutely stable if >= 1)")
         realistic = f"hands from light to firm, walls up to {stiffest / 1e3:.3g} kN/m: μ"
         mu = absolute_stability.structured_singular_value(S)
         for label, value, colour in (
@@ -185,7 +185,7 @@ def draw_z_widths(curves: ReportCurves, z_width: Mapping[str, Any]) -> Figure:
         for label, (key, colour) in shown.items():
             right.plot(damping, [1e-3 * row[key] for row in walls], color=colour, label=label)
         right.set(xlabel="damping of the virtual wall [N s/m]", ylabel="stiffness [kN/m]")
-        right.set_title(f"Virtual walls of the device at {z_width['rate_Hz'] / 1e3:g} kHz")
+        right.set_title(f"Virtual walls, sampled at {z_width['rate_Hz'] / 1e3:g} kHz")
         right.legend()
     return figure
 

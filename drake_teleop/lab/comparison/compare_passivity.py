@@ -80,7 +80,7 @@ def compare_command(
         METHODS.check(name, "methods")
     if "ideal" in networks and "none" in methods:
         what = "method 'none' over network 'ideal' has no channel that measures energy"
-        raise DrakeTeleopError(what, where="networks", remedy="remove the network or the method")
+        raise DrakeTeleopError(what, where="networks", remedy="remove 'ideal' or 'none'")
     base = base_scenario(scenario, seed)  # before the work, as the folder: errors come early
     for method in methods:  # else each of its runs would count as unstable
         settings = Channel(network=networks[0]), PassivityConfig(method=method)

@@ -267,7 +267,7 @@ def print_tables(summary: Mapping[str, Any], out: Path) -> None:
     from rich.table import Table
 
     console, table = Console(), decision_table(summary)
-    grid = Table(title="Rendered share of the contact force", title_justify="left", box=SIMPLE_HEAD)
+    grid = Table(title="Displayed / scaled contact force", title_justify="left", box=SIMPLE_HEAD)
     grid.add_column("Method", no_wrap=True)
     for network in summary["networks"]:
         grid.add_column(f"{network}\n{2e3 * PRESETS[network].delay:g} ms", overflow="fold")

@@ -44,7 +44,7 @@ def write_motion_replay(path: Path, excitation: Excitation) -> None:
         ],
         notes=("Line: path of the sensor, from rest to rest.",),
         clock_label="of the motion",
-        curves_label="force at the sensor, 0 to {top} N",
+        curves_label="colour: force at the sensor, 0 to {top} N",
     )
 
     def make_scene(meshcat: Meshcat) -> replay_file.ShowFrame:

@@ -131,7 +131,7 @@ def RobotFromModel(
             remedy = "give the mass beyond the sensor in kg"
             raise DrakeTeleopError(what, where="--payload", remedy=remedy)
         if payload is None:
-            assumptions.append(f"a load of {mass:g} kg (--payload)")
+            assumptions.append(f"the load has {mass:g} kg (set by --payload)")
         if mass <= load[0]:
             what = f"is {mass:g} kg, but the model contains {load[0]:.3g} kg beyond the sensor"
             remedy = "give the total mass beyond the sensor, or remove the option"

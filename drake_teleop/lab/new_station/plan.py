@@ -104,7 +104,7 @@ def plan_station(
     if axis != tool_axis:
         posture = "posture" if on_sensor is None else "posture without overlaps"
         what = f"no {posture} was found in which {tool_axis}_S, away from the arm, points down"
-        texts.append(f"{axis}_S downwards at the start, as {what}")
+        texts.append(f"{axis}_S points down at the start, because {what}")
     if on_sensor is not None:
         on_sensor.mass = _largest_holdable_tool_mass_kg(model, place.q)
     mass = float(model.phi_load[0]) if on_sensor is None else on_sensor.mass

@@ -22,7 +22,7 @@ BooleanArray: TypeAlias = NDArray[np.bool_]
 
 #: Reasons for a level or cell without value.
 NO_RUN, NO_SUCCESS = "no run", "no successful run"
-INCOMPARABLE = "not comparable with the others"
+NOT_COMPARABLE = "not comparable with the others"
 TOO_FEW_POINTS = "too few points"
 
 
@@ -41,7 +41,7 @@ def missing_value_reasons(
 
     `points` and `successes`: numbers of points, and of runs with a value, at each level or cell.
     """
-    why = np.where(points == 0, NO_RUN, np.where(successes == 0, NO_SUCCESS, INCOMPARABLE))
+    why = np.where(points == 0, NO_RUN, np.where(successes == 0, NO_SUCCESS, NOT_COMPARABLE))
     return np.where(compared, "", why).tolist()
 
 

@@ -25,9 +25,9 @@ from drake_teleop.lab.studies.effects import (
 )
 from drake_teleop.lab.studies.level_model import (
     CONFIDENCE_LEVEL,
-    INCOMPARABLE,
     NO_RUN,
     NO_SUCCESS,
+    NOT_COMPARABLE,
     TOO_FEW_POINTS,
 )
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 _MAX_UNROTATED_LABEL_LETTERS = 24  # letters that fit below a picture
 # Hatches of cells without value.
-_HATCH_BY_REASON = {NO_SUCCESS: "////", NO_RUN: "....", INCOMPARABLE: "xxxx", TOO_FEW_POINTS: ""}
+_HATCH_BY_REASON = {NO_SUCCESS: "////", NO_RUN: "....", NOT_COMPARABLE: "xxxx", TOO_FEW_POINTS: ""}
 
 
 def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
@@ -184,7 +184,7 @@ def draw_pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
 
 def _effects_caption(study: Study, fitted: bool) -> str:
     if not fitted:
-        return _interval_caption(study, "of a level against the mean (dotted)")
+        return _interval_caption(study, "of each level minus the mean (dotted)")
     words = f"; bars: {CONFIDENCE_LEVEL:.0%} intervals of all levels against the mean (dotted)"
     over = "one seed" if study.repeats == 1 else f"{study.repeats} seeds"
     return f"{words}, over the design and {over}"

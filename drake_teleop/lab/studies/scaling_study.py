@@ -246,7 +246,7 @@ def draw_best_scales(
                 dark = abs(scale(rating.merit[i, j]) - 0.5) > 0.3
                 axes.text(j, i, _merit_cell_text(rating, i, j), color="white" if dark else "black",
                           ha="center", va="center", fontsize=7.5)  # fmt: skip
-        bar = figure.colorbar(drawn, ax=grid, label="merit (1: that of sigma = gamma = 1)")
+        bar = figure.colorbar(drawn, ax=grid, label="merit relative to sigma = gamma = 1 (less: better)")
         ticks = [tick for tick in (0.1, 0.2, 0.5, 1, 2, 5, 10) if ends[0] <= tick <= ends[1]]
         bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks], minor=False)
         bar.minorticks_off()

@@ -355,6 +355,6 @@ def draw_detectable_force_over_margin(result: SearchResult, summary: dict[str, A
         figures = summary["figures"]
         axes.plot(figures["margin"], figures["threshold_N"], "o", color=BLACK, label="chosen")
         axes.set(yscale="log", ylabel="smallest detected contact force [N]")
-        axes.set_xlabel("margin: factor by which gamma may grow")
+        axes.set_xlabel("factor of gamma up to instability")
         axes.legend()
     return figure
