@@ -42,7 +42,7 @@ LARGEST_PORT_VALUE = 1e6
 
 
 class Fault(IntEnum):
-    """Codes of faults that set the force at the hand to 0; the lowest active code is reported."""
+    """Codes of faults that suppress the force at the hand; the lowest active code is reported."""
 
     NONE = 0
     OLD_SAMPLE = 1

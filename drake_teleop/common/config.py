@@ -302,8 +302,8 @@ class FieldInfo:
     """Description of a dataclass field.
 
     Attributes:
-        kind: "number", "whole number", "true or false", "word" or "block" (a dataclass); for a
-            list or mapping, the kind of its items.
+        kind: "number", "whole number", "true or false", "word" or "block" (a dataclass); of the
+            items of a list or mapping.
         list_depth: number of nested lists, 0 for one value.
         is_mapping: True if the value maps names to items.
         unit: "1" for a dimensionless quantity; empty if the field is no quantity.

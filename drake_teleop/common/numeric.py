@@ -21,7 +21,7 @@ MAX_ARRAY_VALUE = 1e30
 
 
 def finite_array(name: str, value: ArrayLike, *shape: int, leading: bool = False) -> Array:
-    """Return `value` as a float64 array; raise DrakeTeleopError for another shape, NaN, > 1e30.
+    """Return `value` as a float64 array; raise DrakeTeleopError for another shape, NaN or > 1e30.
 
     `leading` allows more dimensions in front; `name` is for the message.
     """
@@ -195,7 +195,7 @@ def search_minimum(cost: Callable[[float], float], step: float, reach: float) ->
 
 
 def white_noise_deviations(x: Array) -> Array:
-    """Return std (k,) of white noise in smooth signals x (N, k), by third differences."""
+    """Return std (k,) of white noise in smooth x (N, k) by third differences; 0 for N < 4."""
     if len(x) < 4:
         return np.zeros(x.shape[1:])
     # Third differences, whose factors 1, 3, 3, 1 have the square sum 20. The deviation of a normal

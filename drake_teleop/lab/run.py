@@ -64,8 +64,7 @@ class RecordedDrive(Protocol):
     """Recorded live session that can be simulated again."""
 
     @property
-    def folder(self) -> Path:
-        """Folder of the recording."""
+    def folder(self) -> Path: ...
 
     @property
     def scenario(self) -> Scenario:
@@ -75,8 +74,7 @@ class RecordedDrive(Protocol):
     def load(self) -> IdentifiedLoad | None:
         """Load identified before the session; None if it was estimated in the session."""
 
-    def repeat(self, progress: UpdateProgress, log: Path | None = None) -> SimulationResult:
-        """Simulate the recorded session again."""
+    def repeat(self, progress: UpdateProgress, log: Path | None = None) -> SimulationResult: ...
 
 
 def run_command(
@@ -89,7 +87,7 @@ def run_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Run a scenario, or repeat `drive`; replace the results in `out`.
+    """Run a scenario, or repeat the recorded live session `drive`; replace the results in `out`.
 
     Return summary.json and session.json in one dictionary.
     """
@@ -158,12 +156,8 @@ def run_scenario(
 ) -> ScenarioRun:
     """Run a scenario; the load is estimated during the run, or else cached or identified before.
 
-    A run that estimates the load without intent and task uses an excitation trajectory.
-
-    Args:
-        progress: True for progress bars, or a `StartStage`.
-        log: as in `simulate`.
-        fresh: True ignores the cached load.
+    Without operator motion and task, a run that estimates the load excites it by a trajectory.
+    `log` is as in `simulate`; `fresh` ignores the cached load.
     """
     check_scenario(scenario)
     estimates_load, source = scenario.load_estimator.enabled, "estimated during the run"

@@ -163,7 +163,7 @@ def sampling_of_scenario(scenario: Scenario) -> Sampling:
 
 
 def master_displacement_into_sheet_spring(scenario: Scenario) -> list[float]:
-    """Return the master's displacement [m], in its base B, to a tip 5 mm inside the leaf."""
+    """Return the master's displacement [m], in its base B, to a tip 5 mm in the sheet spring."""
     assert scenario.first_sheet_spring is not None
     scaling = scenario.kinematic_scaling
     goal = np.array(scenario.first_sheet_spring.position) - [0.0, 0.0, 5e-3]
@@ -178,9 +178,9 @@ def close_all_loops(system: Linearization, scenario: Scenario) -> Linearization:
 def close_feedback_of_other_directions(
     system: Linearization, scenario: Scenario, along: TaskDirection
 ) -> Linearization:
-    """Return the model with all loops closed, except the hand's loop in the task direction.
+    """Return the linear model with loops closed, except the hand's in the task direction `along`.
 
-    If that direction is parallel to no axis of the master's base B, the hand's loop remains open.
+    If `along` is parallel to no axis of the master's base B, the hand's loop remains open.
     """
     system = close_network(system, scenario)
     (aligned,) = np.nonzero(np.abs(along.hand) > 1 - 1e-9)
@@ -200,7 +200,7 @@ def axis_with_grip(axis: OneAxis, grip: str) -> OneAxis:
 def summarise_diagram_stability(
     point: str, system: Linearization, axis: OneAxis, sampling: Sampling
 ) -> dict[str, Any]:
-    """Return stability and slowest mode (largest multiplier) of the Diagram and of one axis."""
+    """Return stability and slowest mode of the Diagram and of the one-axis model at a point."""
     loop = cut_loop.cut_loop(axis, sampling)
     stable = bool(cut_loop.count_unstable_multipliers(loop, axis.delay) == 0)
     return {
@@ -233,9 +233,9 @@ def with_mean_delays(H: Complex, scenario: Scenario) -> Complex:
 
 
 def two_port_errors_of_axis(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Return the largest deviation of each entry of H from both one-axis models up to 30 Hz.
+    """Return, up to 30 Hz, the largest errors of the continuous and sampled one-axis models.
 
-    The deviations are relative to the entry's largest magnitude. H includes the hand's mass.
+    They are relative to the largest magnitude of each entry of H, which includes the hand's mass.
     """
     compared = OMEGA <= MAX_COMPARED_OMEGA_RAD_S
     with_hand_mass = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)
@@ -252,7 +252,7 @@ def two_port_errors_of_axis(H: Complex, axis: OneAxis, sampling: Sampling) -> di
 
 
 def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict[str, Any]]:
-    """Return stability margins for each grip and standard wall, and for `own_wall` [N/m]."""
+    """Return stability margins by grip and wall: standard ones and the scenario's [N/m]."""
     rows = []
     omega = np.geomspace(1e-2, np.pi * sampling.hand_hz, 6000)
     walls = sorted({*MARGIN_WALL_STIFFNESSES_N_M, own_wall})
@@ -361,7 +361,7 @@ def measure_free_impedance(
 ) -> dict[str, Any]:
     """Return the displayed impedance in free motion, simulated without Coulomb friction.
 
-    The returned errors are relative to the linear model `system`.
+    Return also its relative differences from the linear model `system`.
     """
     frictionless = scenario.master.without_coulomb_friction_and_encoder_steps()
     smooth = replace(scenario.without_environment(), master=frictionless, slave__friction=[])

@@ -42,7 +42,7 @@ class CutLoop:
     def from_multipliers(
         cls, open_multipliers: Complex, closed_multipliers: Complex, period_s: ArrayLike
     ) -> CutLoop:
-        """Return the loop with these multipliers (..., n); find the crossings of |L| = 1."""
+        """Return the loop of models with these eigenvalues (..., n), and its gain crossings."""
         shape, n = open_multipliers.shape[:-1], open_multipliers.shape[-1]
         found = np.zeros((3, *shape, _MAX_GAIN_CROSSINGS))
         _find_gain_crossings_into(
@@ -65,7 +65,7 @@ def cut_loop(axis: OneAxis, sampling: period_map.Sampling) -> CutLoop:
 
 
 def loop_response(loop: CutLoop, omega: ArrayLike, one_way_delay_s: ArrayLike = 0.0) -> Complex:
-    """Return the loop response L (N, ...) at `omega` (N,) [rad/s]; L = 1 is the stability limit."""
+    """Return response L (N, ...) at `omega` (N,) [rad/s]; positive feedback: L = 1 is the limit."""
     dimensions = max(loop.period_s.ndim, np.ndim(one_way_delay_s))
     w = np.atleast_1d(np.asarray(omega, dtype=float)).reshape(-1, *[1] * dimensions)
     z = np.exp(1j * w * loop.period_s)[..., None]
@@ -113,7 +113,7 @@ def count_unstable_multipliers(loop: CutLoop, one_way_delay_s: ArrayLike) -> NDA
 
 
 def delay_margin(loop: CutLoop, round_trip_s: float = 0.0) -> Array:
-    """Return the shortest delay [s] above `round_trip_s` that makes the loop unstable, or inf."""
+    """Return the shortest unstable round-trip delay [s] above `round_trip_s`, or inf."""
     angles = loop.gain_crossing_angles
     phases = loop.gain_crossing_phases - round_trip_s / loop.period_s[..., None] * angles
     inside = (angles > 0) & (angles < np.pi) & (loop.gain_crossing_signs != 0)

@@ -120,8 +120,8 @@ def network_delay_periods(scenario: Scenario) -> tuple[int, int]:
 def two_port_along(system: Linearization, omega: Array, hand: Array, tool: Array) -> Complex:
     """Return the hybrid matrix H (n, 2, 2) along one direction at nonzero `omega` (n,) [rad/s].
 
-    `system` has the hand's loop open in this direction. H includes the hand's mass. `hand` and
-    `tool` (6,) are the vectors of `TaskDirection`.
+    `system` has the hand's loop open in this direction. H includes the hand's mass. `hand` (6,) is
+    the direction at E in B, `tool` (6,) the wrench in W of a unit force at the tip.
     """
     G = system.frequency_response(omega)
     i, o = list(system.inputs), list(system.outputs)

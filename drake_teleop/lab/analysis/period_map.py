@@ -1,6 +1,6 @@
 """Sampled one-axis model of the station over a hand period, 1 / `Sampling.hand_hz`.
 
-All updates at one instant read earlier values. Device and servo hold their forces; the sensor
+Updates at one instant use values from before it. Device and servo hold their forces; the sensor
 samples just before the servo's update.
 """
 
@@ -44,9 +44,9 @@ def one_way_delay_in_hand_periods(axis: OneAxis, sampling: Sampling) -> int:
 
 
 def transition_matrix_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
-    """Return the one-axis model's transition matrix over one hand period, with its loop cut.
+    """Return the one-axis transition matrix over a hand period, cut at the received force.
 
-    The matrix (..., n + 3, n + 3) maps n states, two held forces and the received force.
+    It maps n states, held hand and environment forces, received force: (..., n + 3, n + 3).
     """
     if axis.ideal_servo:
         what = "the sampled model does not include an ideal servo"

@@ -134,9 +134,9 @@ def compare_command(
 def longest_stable_round_trip(
     method: str, model: OneDof, jitter: float, loss: float, seeds: Sequence[int]
 ) -> float:
-    """Return the longest of `ROUND_TRIPS_S` [s] up to which all runs are stable; 0: none.
+    """Return the longest round trip [s] up to which all runs are stable; 0: none.
 
-    Without `jitter` and `loss` only the first seed runs.
+    Without `jitter` (share of the delay) and `loss` (probability) only the first seed runs.
     """
     longest = 0.0
     for round_trip in ROUND_TRIPS_S:
@@ -150,7 +150,7 @@ def longest_stable_round_trip(
 
 
 def base_scenario(scenario: str | Path, seed: int) -> Scenario:
-    """Return the scenario at the comparison's rates, without environment, detection, estimator."""
+    """Return the scenario without environment, contact detection and load estimator."""
     given = LoadScenario(scenario).without_environment()
     check_can_press(given)
     return replace(
@@ -165,7 +165,7 @@ def base_scenario(scenario: str | Path, seed: int) -> Scenario:
 def simulate_press(
     scenario: Scenario, method: str, network: str, leaf: str, estimate: Array
 ) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Simulate a press on a sheet spring; return its measures (table row) and time series."""
+    """Simulate a press on a sheet spring (`leaf`); return measures (a row) and time series."""
     row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
     names = [entry.name for entry in dataclasses.fields(RunMeasures)]
     names += ["pressed_force", "felt_share", "left_behind", "leaked", "fast_force"]
@@ -211,7 +211,7 @@ def _simulate_press_while_stable(
 
 @dataclass(frozen=True)
 class ReleaseAndTaps:
-    """Measures after the hand releases the device, and while it taps a wall, all >= 0."""
+    """Nonnegative measures: motion after release of the device, impulses of taps, leaked energy."""
 
     release_force: float  #: mean magnitude of the force on the hand, 0.1 s before release [N]
     release_speed: float  #: largest speed of the device in the 2 s after release [m/s]

@@ -57,7 +57,7 @@ class Task:
     rest_window: float = 1.9  #: length of the windows in which rest is required
 
     def is_held(self, t: Array) -> NDArray[np.bool_]:
-        """Return whether times (N,) [s] are in the rest window, the last part of the hold."""
+        """Return whether times (N,) [s] are in the last `rest_window` of the hold."""
         return (t >= self.release_start - self.rest_window) & (t < self.release_start)
 
 
@@ -99,8 +99,8 @@ at 12 instead of 14 Hz, delay 17 instead of 13 ms.
 class OneDofRun:
     """Time series (N,) of a run.
 
-    `input_energies` (N, 4) is the energy [J] put into the station so far at four places, at the
-    master's scale. In a passive station, AT_HAND plus any other is at least -start_energy::
+    `input_energies` (N, 4) is the energy [J] put into the station so far at four places, scaled to
+    the master. In a passive station, AT_HAND plus any other is at least -start_energy::
 
         AT_HAND     -sum f_(k-1) (x_k - x_(k-1))   f: displayed force, held
         AT_COMMAND   sum w_k (c_k - c_(k-1))       w: sent wrench; c: command; no physical port
@@ -120,7 +120,7 @@ class OneDofRun:
     start_energy: float  #: E_0 of the method's stores [J]
 
     def least_energy_sum(self, place: int) -> float:
-        """Return the minimum over time [J] of start energy plus input at AT_HAND and `place`.
+        """Return the minimum [J] of start energy plus input at the hand and a place (column).
 
         Negative: the station is active.
         """

@@ -1,7 +1,7 @@
 """The whole station: task (swing, press on a sheet spring, rest), measures and energy balances.
 
-The balances are those of `OneDofRun.input_energies`, at the master's scale, positive inwards [J],
-for translation and rotation. AT_MOTOR is computed from motor torque minus gravity torque.
+Energies [J] are put in at hand, command, motors and slave, in units of the master's side, for
+translation and rotation. The motors' energy is from motor torque minus gravity torque.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ def force_and_energy_traces(result: SimulationResult, scenario: Scenario) -> dic
 
 
 def injected_energy(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the energy (N,) [J] that hand and environment put in so far, plus `start_energy`."""
+    """Return the start energy plus the energy (N,) [J] put in so far by hand and environment."""
     energies = station_energies(result, scenario)[:, [AT_HAND, AT_SLAVE]].sum(axis=1)
     if any(scenario.force_scaling.scales().load_scales):
         energies += work_of_displayed_load_wrench(result, scenario)
@@ -153,9 +153,9 @@ def _slave_height_and_rotation(result: SimulationResult, scenario: Scenario) -> 
 
 
 def station_energies(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the energies (N, 4, 2) [J] put in so far at four places, by translation and rotation.
+    """Return energies (N, place, translation or rotation) [J] put in so far; AT_HAND to AT_SLAVE.
 
-    Places: AT_HAND to AT_SLAVE. AT_MOTOR is NaN if the log is slower than the joint control.
+    AT_MOTOR is NaN if the log is slower than the joint control.
     """
     needed = ("ports", "slave_state", "joint_torque")
     if missing := [name for name in needed if name not in result]:

@@ -142,8 +142,7 @@ class CollisionScene:
     ) -> tuple[dict[_ShapePair, Array], list[str]]:
         """Return distances (T,) [m] by pair that may collide, and names of body pairs in contact.
 
-        Excluded pairs are on one link, almost always near, at constant distance, or in contact at
-        `start`.
+        Excluded: pairs on one link, almost always near, at constant distance, touching at `start`.
         """
         manager = self.scene_graph.collision_filter_manager()
         for link in set(self._rows.values()):
@@ -187,7 +186,7 @@ class CollisionScene:
     def bounding_capsules_and_pairs(
         self, candidates: dict[_ShapePair, Array], postures: Array
     ) -> dict[str, NDArray[Any]]:
-        """Return the `Limits` fields of the shapes' bounding capsules and their candidate pairs."""
+        """Return `Limits` fields `capsule_*` of shapes, and of their pairs that may collide."""
         inspector = self.scene_graph.model_inspector()
         context = self.diagram.CreateDefaultContext()
         plant_context = self.plant.GetMyContextFromRoot(context)

@@ -74,7 +74,7 @@ def finite_half_ranges(q_half: Array) -> Array:
 
 @njit(cache=True)
 def link_motion_series(table, q, qd, qdd):
-    """Return the motions [s, omega, alpha, p, R] in W of all links at T samples (T, n+1, 21)."""
+    """Return specific force to rotation [s, omega, alpha, p, R] of links in W (T, n+1, 21)."""
     motions = np.empty((len(q), q.shape[1] + 1, SENSOR_MOTION_SIZE))
     for t in range(len(q)):
         link_motions(table, q[t], qd[t], qdd[t], motions[t])
@@ -83,7 +83,7 @@ def link_motion_series(table, q, qd, qdd):
 
 @njit(cache=True)
 def sensor_motion_series(motions):
-    """Return specific force, omega and alpha of the sensor, in S, as one array (3, T, 3)."""
+    """Return specific force, omega and alpha (3, T, 3) of the sensor in S, the last link."""
     out = np.empty((3, len(motions), 3))
     for t in range(len(motions)):
         for k in range(3):
@@ -94,7 +94,7 @@ def sensor_motion_series(motions):
 
 @njit(cache=True)
 def add_gradient_by_joints(table, motions, qd, qdd, g_V, gradient):
-    """Add to `gradient` derivatives by q, qd, qdd of a scalar with gradient g_V by regressor V."""
+    """Add dJ/dq, dJ/dqd, dJ/dqdd to `gradient` (3, T, n), from g_V = dJ/dV (V: regressor)."""
     buffers, g = _allocate_gradient_buffers(motions), np.empty((3, 3))
     seed = buffers[0][-1]
     for t in range(len(motions)):
@@ -110,9 +110,9 @@ def add_gradient_by_joints(table, motions, qd, qdd, g_V, gradient):
 
 @njit(cache=True)
 def max_limit_uses_into(table, q, qd, qdd, motions, limits, sharpness, gradient):
-    """Return the largest use of each of `LIMIT_NAMES` over all samples: smooth (7,), exact (7,).
+    """Return smooth and exact maxima over samples of value over limit, by `LIMIT_NAMES` (7,).
 
-    Write the gradient (7, 3, T, n) of the smooth uses by q, qd, qdd (T47).
+    Write the gradient (7, 3, T, n) of the smooth ones by q, qd, qdd (T, n) (T47).
     """
     gradient[:] = 0.0
     smooth, largest = np.empty(7), np.empty(7)

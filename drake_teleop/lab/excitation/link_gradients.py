@@ -1,7 +1,7 @@
 """Gradients of functions of a serial arm's link motions, by the adjoint recursion (T48, T49).
 
-A seed contains the derivatives of a scalar J by a link's motion ``[s, omega, alpha, p, R]`` in W
-(specific force to rotation matrix). The derivative by R is g of ``dJ = g . dtheta``.
+An adjoint (21,) contains the derivatives of a scalar J by a link's motion in W, which is
+``[s, omega, alpha, p, R]``. That by R is the vector g of dJ = g . dtheta, for rotations dtheta.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def add_point_to_adjoint(motion, point, gradient, seed):
 
 @njit(cache=True)
 def add_wrench_to_adjoint(motion, phi, g_force, g_torque, seed):
-    """Add gradients by the wrench of load phi, in link frame, to `seed`; return s and omega."""
+    """Add dJ/dforce, dJ/dtorque of load phi to `seed`; return s, omega; all in link frame."""
     s = rotate_to_link(motion, vector_at(motion, _S_INDEX))
     w = rotate_to_link(motion, vector_at(motion, _OMEGA_INDEX))
     h, inertia = vector_at(phi, 1), symmetric_matrix_at(phi, 4)
@@ -77,9 +77,9 @@ def add_wrench_to_adjoint(motion, phi, g_force, g_torque, seed):
 
 @njit(cache=True)
 def add_torque_to_adjoints(table, motions, c, virtual_velocities, seeds):
-    """Add the gradients of c . tau to `seeds`; torques tau exclude rotor inertia and damping.
+    """Add the gradients of sum(c * tau) to `seeds`; torques tau exclude rotor inertia and damping.
 
-    Write the links' velocities for joint velocities c (n,) into `virtual_velocities` (n+1, 6).
+    Write link velocities for joint velocities c (n,) into `virtual_velocities` (n+1, 6).
     """
     n = motions.shape[0] - 1
     v = w = p = (0.0, 0.0, 0.0)

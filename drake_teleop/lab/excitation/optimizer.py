@@ -44,9 +44,9 @@ class Evaluation:
 
 
 class DesignProblem:
-    """Trajectory optimisation in x = [q0, sine, cosine] of `FourierTrajectory.rest_to_rest`.
+    """Trajectory optimisation in x = [q0, sine, cosine], the Fourier coefficients of the joints.
 
-    `num_harmonics` of the Fourier series is at least 2.
+    `num_harmonics` is at least 2.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class DesignProblem:
         return FourierTrajectory.rest_to_rest(x[:n], sine, cosine, 1 / self._period_s)
 
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
-        """Return the unknowns of a random motion, about the home posture or any posture."""
+        """Return the unknowns of a random motion, about a random posture unless `near_home`."""
         bounds, harmonics = self._limits, self._num_harmonics
         rate = 2 * np.pi / self._period_s * np.sqrt(harmonics)
         size = np.minimum(bounds.velocity / rate, bounds.acceleration / rate**2)
@@ -169,7 +169,7 @@ def minimise_criterion(
 ) -> list[FeasibleIterate]:
     """Minimise the criterion within the limits; return the improving feasible iterates in order.
 
-    `starts` is the number of descents. `seconds` of CPU time replace it; results then vary.
+    `starts` limits the number of descents; `seconds` limits CPU time instead, so results vary.
     """
     search = _DescentSearch(problem, starts, seconds, progress)
     with one_blas_thread(), suppress(_TimeOutError):

@@ -109,7 +109,7 @@ def RobotFromModel(
 ) -> Robot:
     """Return a serial arm from a model file; weld free bases, lock joints beyond the sensor.
 
-    `acceleration` limits [rad/s^2] replace the model's; `payload` [kg] includes the model's load.
+    `acceleration` limits [rad/s^2] replace the model's; `payload` [kg]: mass beyond the sensor.
     """
     missing: list[str] = []
 
@@ -131,7 +131,7 @@ def RobotFromModel(
             remedy = "give the mass beyond the sensor in kg"
             raise DrakeTeleopError(what, where="--payload", remedy=remedy)
         if payload is None:
-            assumptions.append(f"the load has {mass:g} kg (set by --payload)")
+            assumptions.append(f"the load has {mass:g} kg (--payload sets it)")
         if mass <= load[0]:
             what = f"is {mass:g} kg, but the model contains {load[0]:.3g} kg beyond the sensor"
             remedy = "give the total mass beyond the sensor, or remove the option"

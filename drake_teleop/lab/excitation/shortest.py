@@ -66,7 +66,7 @@ def design_shortest_motion(
     starts: int = 24,
     progress: Callable[[float, float], None] = lambda done, best: None,
 ) -> ShortestMotion:
-    """Design and check the shortest motion that reaches a tolerance.
+    """Design and check the shortest motion that identifies the load within a tolerance.
 
     Raises:
         DrakeTeleopError: if no motion of at most 20 s reaches the tolerance.
@@ -127,11 +127,11 @@ class ShortestMotionProblem(optimizer.DesignProblem):
     """Optimisation of the period T in the unknowns x = [q0, sine, cosine, log T].
 
     Args:
-        errors: (k, 16) linear combinations of offsets and phi; their deviations must be below 1.
+        errors: (k, 16) combinations of offsets and phi, over tolerance; std must be below 1.
         around: unknowns of an earlier motion that candidates vary, if any.
 
     Attributes:
-        best: unknowns of the shortest period passed to `value`.
+        best: unknowns of the shortest motion so far.
     """
 
     def __init__(self, robot: Robot, harmonics: int, errors: Array, around: Array | None) -> None:
@@ -197,7 +197,7 @@ class ShortestMotionProblem(optimizer.DesignProblem):
         return self._period
 
     def deviations(self, motion: tuple[Array, Array, Array], period: float) -> Array:
-        """Return predicted deviations (k,) of `errors`, over tolerances, for white noise only."""
+        """Return standard deviation over tolerance (k,), predicted for white noise only."""
         rows = self._weighted_regressor_rows(*motion)
         return np.sqrt(self._tolerance_scaled_variances(rows, period)[0])
 
@@ -234,7 +234,7 @@ class ShortestMotionProblem(optimizer.DesignProblem):
 
 
 def noise_density_relative_to_wrench_noise(noise: prediction.SensorNoise, phi: Array) -> Array:
-    """Return the density (6, 6) of wrench and motion noise, relative to that of wrench noise."""
+    """Return noise density (6, 6) of wrench plus motion, scaled to unit wrench noise."""
     density = np.diag(noise.white_noise_densities[:6])
     if noise.motion_error_filters is not None:
         at_So = np.eye(6)

@@ -87,7 +87,7 @@ class StartPlace(NamedTuple):
         q: (n,) joint positions at the start [rad, m].
         cube_half_m: half edge of the reachable cube around the start [m].
         joint_margin: smallest distance of a joint to its limit, over half the joint's range.
-        posture_score: score of the posture (`posture_scores`) minus the costs of overlaps and wall.
+        posture_score: result of `posture_scores` minus costs of overlaps and wall.
         wall_edge_m: edge of the wall that fits below the tool [m].
         moves_only_vertically: True if only motion up and down by `cube_half_m` is reachable.
     """
@@ -119,7 +119,7 @@ class StartPlace(NamedTuple):
 
 
 class TrialWalls(Environment):
-    """Floating walls, one of each size in `WALL_EDGES_M`, to be tried below the tool."""
+    """Free bodies, a wall of each size, that are placed below the tool to find overlaps."""
 
     @property
     def slip_speed(self) -> float:
@@ -380,9 +380,8 @@ def nearest_sensor_axis(direction: Array) -> str:
 def sensor_axis_along_tool(arm: ArmModel, p_SScm_S: Array) -> str:
     """Return the axis of S along the tool, with the sign away from the arm.
 
-    It is the axis nearest to `p_SScm_S` [m], the tool's centre of mass, else to the last joint's
-    axis. The sign is that of the displacement from a point P of the arm to this centre, or to So
-    if `p_SScm_S` is 0. P is the point of the last joint's axis that is nearest to the joint before.
+    It is nearest to the tool's centre of mass `p_SScm_S` [m]; if that is 0, to the last joint's
+    axis. Away means from the point of this axis that is nearest to the joint before.
     """
     R = arm.table[-2:, ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(2, 3, 3)
     p = arm.table[-2:, TRANSLATION_COLUMN : TRANSLATION_COLUMN + 3]
@@ -400,7 +399,7 @@ def opposite_axis(axis: str) -> str:
 def tool_frame_advice(
     model: Path, frame: str, axis: str, *, is_along_tool: bool = True, is_site: bool = False
 ) -> str:
-    """Return how to add a sensor frame with z along `axis`, as a text; "" for axis "z"."""
+    """Return a text on how to add a frame with z along `axis` of sensor frame or MJCF site."""
     if axis == "z":
         return ""
     R_SA, name = R_SA_BY_AXIS[axis], f"{frame}_z_to_tool"

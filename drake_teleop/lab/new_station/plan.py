@@ -194,8 +194,8 @@ def _has_tool_beyond_sensor_link(shapes: PostureShapes, axis: str) -> bool:
 def find_base_plane_height(shapes: PostureShapes) -> float:
     """Return the height z_W of the base plane [m]: the lowest point of shapes fixed to the world.
 
-    Without such shapes it is 0, or the first joint's height if that is lower. Below a hanging arm
-    it is 0, or the sensor's lowest height in random postures if that is lower.
+    Without such shapes it is 0, or the first joint's height if lower. Below a hanging arm it is 0,
+    or the sensor's lowest height in random postures if lower.
     """
     heights = shapes.points_on_bodies_W(shapes.anchored_slave_bodies())[:, 2]
     is_known = len(heights) > 0 and not shapes.has_sticks

@@ -122,7 +122,6 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
 
 
 def describe_values_outside_ranges(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return a text for each reproduced value that is outside its accepted range."""
     return [
         f"{row.quantity}: {row.reproduced_value} (accepted: {row.accepted_range}): {row.verdict}"
         for row in compare_with_paper(values_by_full_name(summary))
@@ -194,7 +193,7 @@ def write_report(
     summary: Mapping[str, Any],
     parameters: Sequence[ParameterRow],
 ) -> None:
-    """Write the figures (fig6 to fig8), and report.html with them and a link to replay.html."""
+    """Write the figures (fig6 to fig8), and report.html with them and the given results."""
     names = ("drake_teleop", "drake", "numpy", "scipy", "numba")
     versions = {"Python": platform.python_version()} | {n: metadata.version(n) for n in names}
     write_report_page_and_pictures(

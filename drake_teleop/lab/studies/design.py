@@ -44,7 +44,7 @@ class Factor:
         return list(map(float, self.values)) or self.words or self.flags or self.vectors
 
     def value_at_share(self, share: float) -> FactorValue:
-        """Return the value at a share (0 to 1) of `low` to `high`, or of the listed values."""
+        """Return low + share * (high - low), or the listed value at this share of the list."""
         if self.low is not None and self.high is not None:
             return self.low + share * (self.high - self.low)
         listed = self.level_values()
@@ -141,9 +141,9 @@ class Study:
         return self.samples
 
     def check_num_runs(self, where: str, yes: bool | Callable[[str], bool]) -> None:
-        """Raise DrakeTeleopError for too many runs, or without consent to runs that take days.
+        """Raise DrakeTeleopError for too many runs, or above 100,000 runs without consent.
 
-        `yes` is the consent, or a function from a question to the user's answer.
+        `yes` is the consent, or a function that asks the user a question.
         """
         runs = self.num_points() * self.repeats
         count = f"{runs:,} runs" if runs < 10**15 else f"10^{math.log10(runs):.1f} runs"

@@ -148,7 +148,7 @@ def draw_interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure 
 
 
 def draw_pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
-    """Draw effort against task time and force overshoot; return None without complete points."""
+    """Draw the hand's effort over task time and over force overshoot; None without points."""
     points = pareto_table(study, rows)
     if points is None or not points["complete"].any():
         return None

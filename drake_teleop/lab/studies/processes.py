@@ -1,7 +1,7 @@
 """Execution of a study's runs by processes of this machine, Dask workers or a custom executor.
 
-If a run crashes its process, the runs of its chunk are repeated one by one; a run that crashes
-again gets an error text. With one job, a crash ends the study.
+After a crash the runs of the chunk are repeated singly; one that crashes again gets an error text.
+With one job, a crash ends the study.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ PROCESS_ENDED_ERROR_TEXT = "the run has ended its process"
 def open_executor(
     store: Store, jobs: int, cluster: str | None, executor: Executor | None
 ) -> Iterator[tuple[int, RunChunks]]:
-    """Start the processes; yield the number of parallel runs and a `RunChunks` function.
+    """Start `jobs` processes; yield the number of parallel runs and a function that runs chunks.
 
-    `cluster` is the address of a Dask scheduler, or "local"; `executor` remains open.
+    `cluster` is the address of a Dask scheduler, or "local"; a given `executor` is not shut down.
     """
     if executor is not None:
         if not isinstance(executor, Executor):

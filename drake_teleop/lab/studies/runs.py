@@ -55,8 +55,8 @@ def run_study(
 ) -> pl.DataFrame:
     """Run all runs that `out` does not contain yet; return the rows of all runs, sorted by run.
 
-    `inputs` is JSON data of the inputs besides `study`. `shard` "K/N" restricts runs and rows to
-    this shard; `merge` collects the rows of all shards and runs nothing.
+    `inputs` is JSON data of all else that determines results, to refuse an `out` of other inputs.
+    `shard` "K/N" restricts runs and rows to this shard; `merge` only collects all shards' rows.
     """
     import polars as pl
 

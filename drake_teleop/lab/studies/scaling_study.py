@@ -1,6 +1,6 @@
 """`drake-teleop scaling-study`: best force scales for the simulated operator.
 
-The merit of a point (sigma, gamma) is the mean over tasks of its criteria, relative to those of
+The merit of a point (sigma, gamma) is the mean over tasks of its criteria divided by those of
 sigma = gamma = 1; a bootstrap over seeds gives intervals (docs/scaling-study.md).
 """
 
@@ -88,7 +88,7 @@ def scaling_study_command(
 def judge_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> ScaleRating:
     """Return the rating of each sigma and gamma by these `criteria`.
 
-    `tables` [task][criterion or "success"] are arrays (sigmas, gammas, seeds).
+    `tables[task]` maps criterion names and "success" to arrays (sigmas, gammas, seeds).
     """
     # A task may have none of the selected criteria.
     counted = {task: [name for name in TASK_CRITERIA[task] if name in criteria] for task in tables}
@@ -246,7 +246,7 @@ def draw_best_scales(
                 dark = abs(scale(rating.merit[i, j]) - 0.5) > 0.3
                 axes.text(j, i, _merit_cell_text(rating, i, j), color="white" if dark else "black",
                           ha="center", va="center", fontsize=7.5)  # fmt: skip
-        bar = figure.colorbar(drawn, ax=grid, label="merit relative to sigma = gamma = 1 (less: better)")
+        bar = figure.colorbar(drawn, ax=grid, label="merit (less: better; 1 at sigma = gamma = 1)")
         ticks = [tick for tick in (0.1, 0.2, 0.5, 1, 2, 5, 10) if ends[0] <= tick <= ends[1]]
         bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks], minor=False)
         bar.minorticks_off()

@@ -87,7 +87,7 @@ class OperatingRange:
 
     @property
     def tested_parts(self) -> list[tuple[float, list[str], list[float]]]:
-        """Parts of the test, each with its own seed: factor of gamma, grips, walls [N/m]."""
+        """Parts of the test, each with its own seed: (factor of gamma, grips, walls [N/m])."""
         low, high = self.walls
         margin, hands = self.requirements.loop_gain_margin, list(self.hands)
         walls = np.geomspace(high, low, _NUM_TESTED_WALL_STIFFNESSES if low < high else 1).tolist()
@@ -163,7 +163,7 @@ class TunedSettings:
     low_pass_hz: float
 
     def passivity(self, operating_range: OperatingRange) -> PassivityConfig:
-        """Return the passivity settings; `charged_tdpa` assumes the range's firmest grip."""
+        """Return passivity settings; method charged_tdpa assumes the firmest grip of the range."""
         hand = GRIP_IMPEDANCES[operating_range.hands[-1]]
         stiffness = [hand.stiffness, hand.rotational_stiffness]
         known = dataclasses.replace(charged_tdpa_config(), hand_stiffness=stiffness)
@@ -236,7 +236,7 @@ class StationPressTrial:
 
 @dataclass(frozen=True)
 class OneAxisGammaSearch:
-    """Study function: find the largest gamma that is stable and accurate at all `corners`."""
+    """Study function: find the largest contact force share that is stable in the whole range."""
 
     base_scenario: Scenario
     operating_range: OperatingRange
@@ -328,7 +328,7 @@ def renderable_press_depth(base: Scenario, grip: str) -> float:
 
 
 def rms_above_5_hz(x: Array, period: float) -> float:
-    """Return the rms above 5 Hz of x (N,), less a fitted parabola; inf if not finite."""
+    """Return the rms above 5 Hz of x (N,) minus its fitted parabola; inf if not finite."""
     if not np.isfinite(x).all() or len(x) < 4:
         return float("inf")
     t = np.linspace(-1.0, 1.0, len(x))

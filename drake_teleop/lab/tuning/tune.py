@@ -1,8 +1,7 @@
 """`drake-teleop tune`: method, sigma, gamma, force scale and filter for a station.
 
-The settings must meet the requirements for all stated hands and walls (`OperatingRange`). Stages of
-the search: limit of the linear loop; simulation in one axis; the whole station with all grips at
-the softest to stiffest wall and several seeds.
+The settings must meet the requirements for all given hands and walls. The search uses the linear
+loop's limit, then one-axis simulations, then the whole station with several seeds.
 """
 
 from __future__ import annotations
@@ -65,12 +64,12 @@ def tune(
     Args:
         scenario: shipped name, YAML file, or scenario.
         out: folder of the results; the same call continues an interrupted one.
-        hands: grips; settings are for all from the softest to the firmest.
-        walls: stiffnesses [kN/m]; settings are for all from the lowest to the highest.
+        hands: softest and firmest grip.
+        walls: lowest and highest stiffness [kN/m].
         network: preset; None: channel of the scenario.
         task: press, touch or insert.
         jobs: number of processes; -1: one for each core.
-        quiet: True hides the sentences and progress bars; `progress` False only the bars.
+        quiet: True hides result sentences and progress bars.
 
     Returns:
         The content of summary.json (docs/choose.md).
@@ -220,7 +219,7 @@ def meets_requirements(
 
 
 def make_study_executor(out: Path, inputs: dict[str, Any], jobs: int, progress: bool) -> RunStudy:
-    """Return a function that runs a study in a folder of `out` with the study's name."""
+    """Return a function that runs a named study in the folder `out` / name."""
 
     def execute(name: str, study: Study, work: Any) -> list[Row]:
         with show_progress(progress) as stage:
