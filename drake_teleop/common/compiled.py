@@ -131,9 +131,9 @@ class _CacheFiles:
                 path.unlink(missing_ok=True)
 
 
-def _is_trusted_file(status: os.stat_result) -> bool:
+def _is_trusted_file(file_status: os.stat_result) -> bool:
     owners = {os.getuid(), 0, Path(__file__).stat().st_uid}
-    return status.st_uid in owners and not status.st_mode & stat.S_IWOTH
+    return file_status.st_uid in owners and not file_status.st_mode & stat.S_IWOTH
 
 
 def fingerprint_of_code(dispatcher: Dispatcher) -> str:

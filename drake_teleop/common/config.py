@@ -70,15 +70,15 @@ def with_absolute_paths(config: Any, folder: Path) -> Any:
     Default paths of shipped models remain, unless `folder` contains a file of this name.
     """
 
-    def resolve_paths(value: Any, entry: dataclasses.Field[Any]) -> Any:
+    def resolve_paths(value: Any, field: dataclasses.Field[Any]) -> Any:
         if isinstance(value, list):
-            return [resolve_paths(item, entry) for item in value]
+            return [resolve_paths(item, field) for item in value]
         if dataclasses.is_dataclass(value):
             return with_absolute_paths(value, folder)
-        if not entry.metadata.get("is_path") or not value:
+        if not field.metadata.get("is_path") or not value:
             return value
         path = (folder / value).resolve()
-        return value if value == entry.default and not os.path.isfile(path) else str(path)
+        return value if value == field.default and not os.path.isfile(path) else str(path)
 
     changes = {}
     for entry in dataclasses.fields(config):

@@ -102,7 +102,7 @@ def run_command(
         setup = replace(setup, simulation__seed=seed)
     with files.output_folder(out):
         with show_progress(progress and not quiet) as stage:
-            run = _run_and_log_into_folder(setup, out, stage, fresh, drive)
+            run = _run_and_log_scenario_or_drive(setup, out, stage, fresh, drive)
             written = stage("Write pictures and 3D replay")
             files.write_picture(out / "overview.png", draw_overview(run.result))
             written(0.3)
@@ -120,7 +120,7 @@ def run_command(
     return summary | session
 
 
-def _run_and_log_into_folder(
+def _run_and_log_scenario_or_drive(
     setup: Scenario, out: Path, stage: StartStage, fresh: bool, drive: RecordedDrive | None
 ) -> ScenarioRun:
     log, scenario_file = out / "log.parquet", out / _SCENARIO_FILE_NAME

@@ -160,9 +160,11 @@ def test_delay_is_rounded_to_hand_periods_and_at_least_one(delay: float, steps: 
 
 
 def test_period_map_is_computed_once_for_all_delays_and_equal_gaps(monkeypatch):
-    gaps, slave_rows = [], period_map._slave_rows
+    gaps, slave_rows = [], period_map._slave_transition_rows
     monkeypatch.setattr(
-        period_map, "_slave_rows", lambda *given: gaps.append(given[2]) or slave_rows(*given)
+        period_map,
+        "_slave_transition_rows",
+        lambda *given: gaps.append(given[2]) or slave_rows(*given),
     )
     delays, sigmas = np.linspace(0.0, 0.1, 7), np.array([[0.0], [1.0]])
     M = transition_matrix_of_cut_loop(OneAxis(delay=delays, sigma=sigmas), STATION)

@@ -17,7 +17,7 @@ from drake_teleop.cli.main import main
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.reproduction import experiments, reproduce
 from drake_teleop.lab.reproduction.experiments import (
-    SIGMAS,
+    DISPLAYED_LOAD_SHARES,
     MotionRun,
     RunsWithAndWithoutContact,
     detection_and_peaks_of_contact_run,
@@ -379,7 +379,7 @@ def test_wrong_mass_increases_the_residual():
     estimate = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
     estimate[6:] *= 1.1
     motion = simulate_motion(scenario, estimate, lambda done: None)
-    assert tuple(motion.scaled_wrenches) == SIGMAS
+    assert tuple(motion.scaled_wrenches) == DISPLAYED_LOAD_SHARES
     figures = peaks_and_residuals_of_free_run(motion, 2, "N")
     assert figures["residual_max_N"] == pytest.approx(0.1 * figures["peak_raw_N"], rel=0.05)
     assert figures["half_ratio"] == pytest.approx(0.45, abs=0.01)

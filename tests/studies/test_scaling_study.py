@@ -12,7 +12,7 @@ from shown import type_in
 from drake_teleop.common.files import studies_dir
 from drake_teleop.lab.studies import scaling_study
 from drake_teleop.lab.studies.scaling_study import (
-    CRITERIA_BY_NAME,
+    CRITERIA_BY_CHOICE,
     TASK_CRITERIA,
     draw_best_scales,
     judge_scales,
@@ -86,11 +86,11 @@ def test_seeds_with_failed_reference_are_excluded(failing, best):
 def test_choice_picture_has_one_scale_and_no_empty_cell():
     failing = tables()
     failing["press"]["success"][:2, 0, :3] = 0.0  # three of twenty
-    answers = {way: judge_scales(failing, criteria) for way, criteria in CRITERIA_BY_NAME.items()}
+    answers = {way: judge_scales(failing, criteria) for way, criteria in CRITERIA_BY_CHOICE.items()}
     sigmas, gammas = [0, 0.1, 0.25, 0.5, 1], [0.25, 0.5, 1, 2, 4, 8]
     figure = draw_best_scales(answers, sigmas, gammas)
     images = [image for axes in figure.axes for image in axes.images]
-    assert len(images) == len(CRITERIA_BY_NAME)
+    assert len(images) == len(CRITERIA_BY_CHOICE)
     assert len({image.norm for image in images}) == 1
     for axes, found in zip(figure.axes, answers.values(), strict=False):
         words = {text.get_position(): text.get_text() for text in axes.texts}

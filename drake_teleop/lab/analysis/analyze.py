@@ -15,7 +15,7 @@ from drake_teleop.common.progress import StartStage, show_progress
 from drake_teleop.lab.analysis import absolute_stability, cut_loop, linearization, report, two_port
 from drake_teleop.lab.analysis.frequency_response import MultiSine, measure_frequency_response
 from drake_teleop.lab.analysis.linear_model import COMPONENT_NAMES, MAX_STATES, Linearization
-from drake_teleop.lab.analysis.linearization import close_network, linearize, two_port_along
+from drake_teleop.lab.analysis.linearization import close_network_loop, linearize, two_port_along
 from drake_teleop.lab.analysis.maps import RATE_NAME, StabilityMap, stability_map
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis, environment_impedance
 from drake_teleop.lab.analysis.period_map import Sampling, closed_axis_model, sampled_two_port
@@ -172,7 +172,7 @@ def master_displacement_into_sheet_spring(scenario: Scenario) -> list[float]:
 
 
 def close_all_loops(system: Linearization, scenario: Scenario) -> Linearization:
-    return close_network(system, scenario).close_loop("operator_wrench", "hand_wrench")
+    return close_network_loop(system, scenario).close_loop("operator_wrench", "hand_wrench")
 
 
 def close_feedback_of_other_directions(
@@ -182,7 +182,7 @@ def close_feedback_of_other_directions(
 
     If `along` is parallel to no axis of the master's base B, the hand's loop remains open.
     """
-    system = close_network(system, scenario)
+    system = close_network_loop(system, scenario)
     (aligned,) = np.nonzero(np.abs(along.hand) > 1 - 1e-9)
     others = [axis for k, axis in enumerate(COMPONENT_NAMES) if len(aligned) and k != aligned[0]]
     return system.close_loop(

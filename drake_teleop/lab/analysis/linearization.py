@@ -1,6 +1,6 @@
 """The station's Diagram, linearised at rest by simulations of one period with displaced states.
 
-The loops are cut at (T63)
+Frames: stylus E, master's base B, world W, sensor S with origin So. The loops are cut at (T63)
 
     loop                       output              input
     hand on the stylus         operator_wrench     hand_wrench      F_E_B at E, in B
@@ -99,10 +99,10 @@ def linearize_station(
         remedy = "set method: none, or use measure_frequency_response"
         raise DrakeTeleopError(what, where="passivity.method", remedy=remedy)
     cut = linearize(scenario, load_estimate=load_estimate, displacement=displacement)
-    return close_network(cut.close_loop("operator_wrench", "hand_wrench"), scenario)
+    return close_network_loop(cut.close_loop("operator_wrench", "hand_wrench"), scenario)
 
 
-def close_network(system: Linearization, scenario: Scenario) -> Linearization:
+def close_network_loop(system: Linearization, scenario: Scenario) -> Linearization:
     forward, backward = network_delay_periods(scenario)
     system = system.close_loop("pose_command", "pose_received", forward)
     return system.close_loop("wrench_B", "wrench_received", backward)

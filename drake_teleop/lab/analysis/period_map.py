@@ -67,7 +67,9 @@ def transition_matrix_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
     sensor = _sensor_transition_rows(zeros[..., SAMPLED_FORCE:n, :], axis, sections)
     times = sorted({Fraction(k, m) for m in (servo_samples, sensor_samples) for k in range(m)})
     gaps = [end - time for time, end in itertools.pairwise([*times, Fraction(1)])]
-    slave = {gap: _slave_rows(two_rows, axis, float(gap) * hand_period) for gap in set(gaps)}
+    slave = {
+        gap: _slave_transition_rows(two_rows, axis, float(gap) * hand_period) for gap in set(gaps)
+    }
     M = zeros + np.eye(n + 3)
     for time, gap in zip(times, gaps, strict=True):
         new = M.copy()
@@ -190,7 +192,7 @@ def _sensor_transition_rows(zero_rows: Array, axis: OneAxis, sections: Array) ->
     return rows
 
 
-def _slave_rows(zero_rows: Array, axis: OneAxis, time: Array) -> Array:
+def _slave_transition_rows(zero_rows: Array, axis: OneAxis, time: Array) -> Array:
     rows, mass = zero_rows.copy(), axis.slave_mass
     springs = axis.wall_stiffness / mass, axis.wall_damping / mass
     responses = mass_spring_unit_responses(*springs, time)

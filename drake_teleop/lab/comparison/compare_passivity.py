@@ -109,7 +109,7 @@ def compare_command(
     # Workers import this module without matplotlib and polars.
     import polars as pl
 
-    from drake_teleop.lab.comparison.report import decision_table, print_tables, write_report
+    from drake_teleop.lab.comparison.report import print_tables, stability_table, write_report
 
     summary["decision"] = [
         {
@@ -120,7 +120,7 @@ def compare_command(
             "pressed_N": [pressed for _, pressed in cell.force_pairs],
             "leaked_J": cell.leaked_J,
         }
-        for (method, network), cell in decision_table(summary).items()
+        for (method, network), cell in stability_table(summary).items()
     ]
     with output_folder(out):
         write_table(out / "runs.parquet", pl.DataFrame(runs, infer_schema_length=None))

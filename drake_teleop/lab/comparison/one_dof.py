@@ -278,8 +278,8 @@ def measures_of_traces(
     rest = window_slice(task.end - task.rest_window, task.end)
     swing = window_slice(task.swing_start, task.swing_end)
     parts, angles = (hold, rest), () if turned is None else turned.T
-    hunting = max(_peak_to_peak_of_rest(x[part]) for x in (master, slave) for part in parts)
-    turning = max((_peak_to_peak_of_rest(x[part]) for x in angles for part in parts), default=0.0)
+    hunting = max(_detrended_peak_to_peak(x[part]) for x in (master, slave) for part in parts)
+    turning = max((_detrended_peak_to_peak(x[part]) for x in angles for part in parts), default=0.0)
     steady, goal = float(hand_force[hold].mean()), float(pressed[hold].mean())
     after = min(round((task.release_end + 2.0) / dt), len(t) - 1)
     start = round(task.press_start / dt)
@@ -318,7 +318,7 @@ def _displayed_impedance_real_part(model: OneDof, round_trip: float) -> Array:
     return np.asarray(displayed.real)
 
 
-def _peak_to_peak_of_rest(x: Array) -> float:
+def _detrended_peak_to_peak(x: Array) -> float:
     if not np.isfinite(x).all():
         return float("inf")
     t = np.linspace(-1.0, 1.0, len(x))
@@ -336,8 +336,8 @@ def _rise_delay_in_samples(hand_force: Array, contact_force: Array, steady_force
 
 @njit(cache=True)
 def _simulate_one_dof_run(
-    method_steps, model, holds_motor_force, method_parameters, forward_line, backward_line,
-    forward, backward, end_states, start, timeout, inputs,
+    method_steps, model, holds_motor_force, method_parameters, forward_network, backward_network,
+    forward_state, backward_state, channel_end_states, start, timeout, inputs,
 ):  # fmt: skip
     device_mass, friction, slave_mass, K, D, ideal, slave_friction, lag = model[:8]
     tool_mass, wall_damping, scale, sigma, gamma = model[8:13]
@@ -369,8 +369,8 @@ def _simulate_one_dof_run(
         # A literal False would compile the whole channel once more.
         step_channel(
             method_steps, pose_m, wrench, load, hand, pose_s, np.bool_(False), 0.0, PERIOD_S,
-            timeout, frame, method_parameters, forward_line, backward_line, forward, backward,
-            end_states, received, ports, displayed,
+            timeout, frame, method_parameters, forward_network, backward_network, forward_state,
+            backward_state, channel_end_states, received, ports, displayed,
         )  # fmt: skip
         command, energies[AT_COMMAND] = received[4], ports[6]
         copy_into(rows[k], 0, (x, x_s, command, displayed[0], wall, ports[0], ports[2]), 0, 7)

@@ -73,11 +73,11 @@ def finite_half_ranges(q_half: Array) -> Array:
 
 
 @njit(cache=True)
-def link_motion_series(table, q, qd, qdd):
+def link_motion_series(arm_table, q, qd, qdd):
     """Return specific force to rotation [s, omega, alpha, p, R] of links in W (T, n+1, 21)."""
     motions = np.empty((len(q), q.shape[1] + 1, SENSOR_MOTION_SIZE))
     for t in range(len(q)):
-        link_motions(table, q[t], qd[t], qdd[t], motions[t])
+        link_motions(arm_table, q[t], qd[t], qdd[t], motions[t])
     return motions
 
 
@@ -93,7 +93,7 @@ def sensor_motion_series(motions):
 
 
 @njit(cache=True)
-def add_gradient_by_joints(table, motions, qd, qdd, g_V, gradient):
+def add_gradient_by_joints(arm_table, motions, qd, qdd, g_V, gradient):
     """Add dJ/dq, dJ/dqd, dJ/dqdd to `gradient` (3, T, n), from g_V = dJ/dV (V: regressor)."""
     buffers, g = _allocate_gradient_buffers(motions), np.empty((3, 3))
     seed = buffers[0][-1]
@@ -105,11 +105,11 @@ def add_gradient_by_joints(table, motions, qd, qdd, g_V, gradient):
         seed[:] = 0.0
         for k in range(3):
             add_vector_to_adjoint(motion, 3 * k, vector_at(g[k], 0), seed)
-        _add_joint_gradients_at_sample(table, qd, qdd, motions, t, gradient, buffers)
+        _add_joint_gradients_at_sample(arm_table, qd, qdd, motions, t, gradient, buffers)
 
 
 @njit(cache=True)
-def max_limit_uses_into(table, q, qd, qdd, motions, limits, sharpness, gradient):
+def max_limit_uses_into(arm_table, q, qd, qdd, motions, limits, sharpness, gradient):
     """Return smooth and exact maxima over samples of value over limit, by `LIMIT_NAMES` (7,).
 
     Write the gradient (7, 3, T, n) of the smooth ones by q, qd, qdd (T, n) (T47).
@@ -122,7 +122,7 @@ def max_limit_uses_into(table, q, qd, qdd, motions, limits, sharpness, gradient)
         use = np.abs(x) / scales[k]
         largest[k], smooth[k] = _exact_and_smooth_maximum(use, sharpness)
         gradient[k, k] = use * (np.sign(x) / scales[k])
-    samples = table, q, qd, qdd, motions
+    samples = arm_table, q, qd, qdd, motions
     largest[3], smooth[3] = _max_torque_use_into(samples, limits, sharpness, gradient[3])
     largest[4], smooth[4] = _max_sensor_use_into(samples, limits, sharpness, gradient[4])
     largest[5], smooth[5] = _max_workspace_use_into(samples, limits, sharpness, gradient[5])
@@ -154,40 +154,40 @@ def _allocate_gradient_buffers(motions):
 
 
 @njit(cache=True)
-def _add_joint_gradients_at_sample(table, qd, qdd, motions, t, gradient, buffers):
-    seeds, c, virtual = buffers
+def _add_joint_gradients_at_sample(arm_table, qd, qdd, motions, t, gradient, buffers):
+    seeds, weights, virtual = buffers
     pull_back_adjoints(
-        table, motions[t], qd[t], qdd[t], c, virtual, seeds,
+        arm_table, motions[t], qd[t], qdd[t], weights, virtual, seeds,
         gradient[0, t], gradient[1, t], gradient[2, t],
     )  # fmt: skip
 
 
 @njit(cache=True, inline="always")
 def _max_torque_use_into(samples, limits, sharpness, gradient):
-    table, q, qd, qdd, motions = samples
+    arm_table, q, qd, qdd, motions = samples
     tau = np.empty(q.shape)
     for t in range(len(q)):
-        inverse_dynamics(table, q[t], qd[t], qdd[t], tau[t])
+        inverse_dynamics(arm_table, q[t], qd[t], qdd[t], tau[t])
     use = np.abs(tau) / limits.max_torques
     maxima = _exact_and_smooth_maximum(use, sharpness)
     buffers = _allocate_gradient_buffers(motions)
-    seeds, c, virtual = buffers
+    seeds, weights, virtual = buffers
     for t in range(len(q)):
         if use[t].max() < _NEGLIGIBLE_GRADIENT_WEIGHT:
             continue
         seeds[:] = 0.0
-        c[:] = use[t] * np.sign(tau[t]) / limits.max_torques
+        weights[:] = use[t] * np.sign(tau[t]) / limits.max_torques
         # Table columns 22 and 23: rotor inertia and joint damping.
-        gradient[2, t] += c * table[:-1, 22]
-        gradient[1, t] += c * table[:-1, 23]
-        add_torque_to_adjoints(table, motions[t], c, virtual, seeds)
-        _add_joint_gradients_at_sample(table, qd, qdd, motions, t, gradient, buffers)
+        gradient[2, t] += weights * arm_table[:-1, 22]
+        gradient[1, t] += weights * arm_table[:-1, 23]
+        add_torque_to_adjoints(arm_table, motions[t], weights, virtual, seeds)
+        _add_joint_gradients_at_sample(arm_table, qd, qdd, motions, t, gradient, buffers)
     return maxima
 
 
 @njit(cache=True, inline="always")
 def _max_sensor_use_into(samples, limits, sharpness, gradient):
-    table, _, qd, qdd, motions = samples
+    arm_table, _, qd, qdd, motions = samples
     sensor, size = sensor_motion_series(motions), np.empty((len(motions), 4))
     x = np.empty((len(motions), 12))  # force, torque, s, alpha in S
     x[:, 6:9], x[:, 9:] = sensor[0], sensor[2]
@@ -212,13 +212,13 @@ def _max_sensor_use_into(samples, limits, sharpness, gradient):
         add_wrench_to_adjoint(motion, limits.heaviest_phi, vector_at(g, 0), vector_at(g, 3), seed)
         add_vector_to_adjoint(motion, 0, vector_at(g, 6), seed)
         add_vector_to_adjoint(motion, 6, vector_at(g, 9), seed)
-        _add_joint_gradients_at_sample(table, qd, qdd, motions, t, gradient, buffers)
+        _add_joint_gradients_at_sample(arm_table, qd, qdd, motions, t, gradient, buffers)
     return maxima
 
 
 @njit(cache=True, inline="always")
 def _max_workspace_use_into(samples, limits, sharpness, gradient):
-    table, _, qd, qdd, motions = samples
+    arm_table, _, qd, qdd, motions = samples
     T, P = len(motions), len(limits.points_S)
     x = np.empty((T, P, 3))
     for t in range(T):
@@ -236,13 +236,13 @@ def _max_workspace_use_into(samples, limits, sharpness, gradient):
         seed[:] = 0.0
         for k in range(P):
             add_point_to_adjoint(motions[t, -1], limits.points_S[k], vector_at(by_x[t, k], 0), seed)
-        _add_joint_gradients_at_sample(table, qd, qdd, motions, t, gradient, buffers)
+        _add_joint_gradients_at_sample(arm_table, qd, qdd, motions, t, gradient, buffers)
     return maxima
 
 
 @njit(cache=True, inline="always")
 def _max_clearance_use_into(samples, limits, sharpness, gradient):
-    table, _, qd, qdd, motions = samples
+    arm_table, _, qd, qdd, motions = samples
     T, K = len(motions), len(limits.capsule_pairs)
     use, ends = np.empty((T, K)), np.empty((T, *limits.capsule_ends.shape))
     for t in range(T):
@@ -274,7 +274,7 @@ def _max_clearance_use_into(samples, limits, sharpness, gradient):
                     start, along = _start_and_direction(limits.capsule_ends[capsule])
                     point = plus(start, scale_vector(share, along))
                     add_point_to_adjoint(motions[t, row], point, scale_vector(sign, g), seeds[row])
-        _add_joint_gradients_at_sample(table, qd, qdd, motions, t, gradient, buffers)
+        _add_joint_gradients_at_sample(arm_table, qd, qdd, motions, t, gradient, buffers)
     return maxima
 
 
@@ -321,7 +321,7 @@ def _are_segments_surely_apart(first, second, distance):
     # Sufficient condition for two segments (2, 3): four times the square of the middles' distance.
     (a, along_a), (b, along_b) = _start_and_direction(first), _start_and_direction(second)
     between = minus(minus(plus(a, vector_at(first[1], 0)), b), vector_at(second[1], 0))
-    # (a + b + c)^2 <= 3 (a^2 + b^2 + c^2)
+    # (a + b + weights)^2 <= 3 (a^2 + b^2 + weights^2)
     squares = dot(along_a, along_a) + dot(along_b, along_b) + 4 * distance * distance
     return dot(between, between) > 3 * squares
 

@@ -76,7 +76,7 @@ def add_wrench_to_adjoint(motion, phi, g_force, g_torque, seed):
 
 
 @njit(cache=True)
-def add_torque_to_adjoints(table, motions, c, virtual_velocities, seeds):
+def add_torque_to_adjoints(arm_table, motions, c, virtual_velocities, seeds):
     """Add the gradients of sum(c * tau) to `seeds`; torques tau exclude rotor inertia and damping.
 
     Write link velocities for joint velocities c (n,) into `virtual_velocities` (n+1, 6).
@@ -84,13 +84,13 @@ def add_torque_to_adjoints(table, motions, c, virtual_velocities, seeds):
     n = motions.shape[0] - 1
     v = w = p = (0.0, 0.0, 0.0)
     for row in range(n + 1):
-        motion, phi = motions[row], table[row, 12:22]
+        motion, phi = motions[row], arm_table[row, 12:22]
         here = vector_at(motion, _P_INDEX)
         v = plus(v, cross(w, minus(here, p)))
         p = here
         if row < n:
             along = scale_vector(c[row], (motion[14], motion[17], motion[20]))
-            if table[row, IS_PRISMATIC_COLUMN] != 0.0:
+            if arm_table[row, IS_PRISMATIC_COLUMN] != 0.0:
                 v = plus(v, along)
             else:
                 w = plus(w, along)
@@ -107,7 +107,7 @@ def add_torque_to_adjoints(table, motions, c, virtual_velocities, seeds):
 
 
 @njit(cache=True)
-def pull_back_adjoints(table, motions, qd, qdd, c, virtual_velocities, seeds, g_q, g_qd, g_qdd):
+def pull_back_adjoints(arm_table, motions, qd, qdd, c, virtual_velocities, seeds, g_q, g_qd, g_qdd):
     """Add the gradients by q, qd, qdd to `g_q`, `g_qd`, `g_qdd` (n,), from the seeds of all links.
 
     `c` and `virtual_velocities` are those of `add_torque_to_adjoints`, or zeros.
@@ -124,7 +124,7 @@ def pull_back_adjoints(table, motions, qd, qdd, c, virtual_velocities, seeds, g_
         gt = plus(gt, vector_at(seed, _THETA_INDEX))
         gv = plus(gv, vector_at(seed, _VIRTUAL_V_INDEX))
         go = plus(go, vector_at(seed, _VIRTUAL_W_INDEX))
-        z, slides = (motion[14], motion[17], motion[20]), table[row, IS_PRISMATIC_COLUMN] != 0.0
+        z, slides = (motion[14], motion[17], motion[20]), arm_table[row, IS_PRISMATIC_COLUMN] != 0.0
         if row < n and slides:
             gz = plus(scale_vector(qdd[row], gs), scale_vector(2.0 * qd[row], cross(gs, w)))
             gz = plus(gz, scale_vector(c[row], gv))

@@ -52,8 +52,8 @@ def write_motion_replay(path: Path, excitation: Excitation) -> None:
         _add_table_and_sensor_path(meshcat, path_S, bodies)
         _AddLinkShapesAndLines(meshcat, robot, context)
 
-        def show(replay_time: float, frame: int) -> None:
-            for body, X_WB in poses[frame][0].items():
+        def show(replay_time: float, picture_index: int) -> None:
+            for body, X_WB in poses[picture_index][0].items():
                 meshcat.SetTransform(f"/arm/{int(body)}", X_WB, replay_time)
 
         return show

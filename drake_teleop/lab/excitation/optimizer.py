@@ -94,13 +94,13 @@ class DesignProblem:
         smooth, largest = self._write_joint_gradients(q_qd_qdd, g_V, limit_sharpness, g)
         return Evaluation(value, smooth, self._gradients_by_coefficients(), largest)
 
-    def _evaluate_motion(self, x: Array, slowdown: float = 1.0) -> Array:
+    def _evaluate_motion(self, x: Array, time_factor: float = 1.0) -> Array:
         # q, qd, qdd (3, T, n); also writes the motions of links and sensor.
         n = len(self._home)
         q_qd_qdd: Array = self._basis @ x[n:].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
         q_qd_qdd[0] += x[:n]
-        q_qd_qdd[1] /= slowdown
-        q_qd_qdd[2] /= slowdown**2
+        q_qd_qdd[1] /= time_factor
+        q_qd_qdd[2] /= time_factor**2
         self._motions = limits.link_motion_series(self._table, *q_qd_qdd)
         self._vectors = limits.sensor_motion_series(self._motions)
         return q_qd_qdd

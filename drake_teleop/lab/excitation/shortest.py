@@ -118,9 +118,9 @@ def design_shortest_motion(
     raise DrakeTeleopError(what, where=f"{robot.name}: {tolerance}", remedy=remedy)
 
 
-def sidak_factor(count: int) -> float:
-    """Return z: with 95 % probability `count` errors are all within z deviations (Sidak)."""
-    return float(ndtri(0.5 + 0.5 * PROBABILITY_ALL_WITHIN_TOLERANCE ** (1.0 / count)))
+def sidak_factor(num_errors: int) -> float:
+    """Return z: with 95 % probability `num_errors` errors are all within z deviations (Sidak)."""
+    return float(ndtri(0.5 + 0.5 * PROBABILITY_ALL_WITHIN_TOLERANCE ** (1.0 / num_errors)))
 
 
 class ShortestMotionProblem(optimizer.DesignProblem):

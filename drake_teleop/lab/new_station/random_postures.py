@@ -120,8 +120,8 @@ def select_suitable_postures(
 ) -> tuple[Postures, StartRegion]:
     """Return postures with the tool downwards, in reach and above the base plane, and their region.
 
-    They are in one direction from the first joint, that with most postures. `plane` is the height
-    z_W of the base plane [m].
+    Only the horizontal direction from the first joint with most postures remains. `plane` is the
+    height z_W of the base plane [m].
     """
     first = postures.origins[:, 0].mean(axis=0)
     from_first = postures.p_WS - first

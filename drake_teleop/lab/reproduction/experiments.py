@@ -27,7 +27,7 @@ from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 NamedValues = dict[str, Any]
 
-SIGMAS = (1.0, 0.5, 0.0)
+DISPLAYED_LOAD_SHARES = (1.0, 0.5, 0.0)
 _CONTACT_THRESHOLD_TO_FREE_PEAK_RATIO = 1.5
 
 
@@ -85,7 +85,7 @@ def simulate_motion(scenario: Scenario, estimate: Array, progress: UpdateProgres
     parts = wrench, estimate[:6], s, omega, alpha, estimate[6:], np.zeros(10)  # no object
     scaled = {
         sigma: scaled_wrench(*parts, sigma_gripper=sigma, sigma_object=sigma, gamma=1.0)
-        for sigma in SIGMAS
+        for sigma in DISPLAYED_LOAD_SHARES
     }
     return MotionRun(scenario, result, scaled)
 
@@ -147,7 +147,7 @@ def wrench_errors_of_ideal_run(run: IdealSensorRun) -> NamedValues:
 
 def peaks_and_residuals_of_free_run(run: MotionRun, component: int, unit: str) -> NamedValues:
     """Return peak, rms at sigma 0.5 over 1, and residuals (sigma 0) of one wrench component."""
-    raw, half, rest = (run.scaled_wrenches[sigma][:, component] for sigma in SIGMAS)
+    raw, half, rest = (run.scaled_wrenches[sigma][:, component] for sigma in DISPLAYED_LOAD_SHARES)
     vector = slice(0, 3) if component < 3 else slice(3, 6)
     scale = run.scenario.force_scaling.force_scale
     peak = float(np.abs(raw).max())
@@ -225,7 +225,7 @@ def errors_of_identification(load: LoadIdentification, scenario: Scenario) -> Na
 
 
 def true_offsets_and_phi(scenario: Scenario) -> Array:
-    """Return the true sensor offsets, then phi, as an array (16,)."""
+    """Return the true sensor offsets, then phi, (16,), of Eq. (7)."""
     return np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
 
 

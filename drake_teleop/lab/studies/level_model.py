@@ -270,9 +270,9 @@ def _pair_products(a: Array, b: Array) -> Array:
     return np.einsum("ni,nj->nij", a, b).reshape(len(a), -1)
 
 
-def _effect_codes(count: int, present: NDArray[np.int64]) -> Array:
-    codes = np.zeros((count, len(present) - 1))
-    codes[present[:-1]], codes[present[-1]] = np.eye(len(present) - 1), -1.0
+def _effect_codes(num_levels: int, used: NDArray[np.int64]) -> Array:
+    codes = np.zeros((num_levels, len(used) - 1))
+    codes[used[:-1]], codes[used[-1]] = np.eye(len(used) - 1), -1.0
     return codes
 
 

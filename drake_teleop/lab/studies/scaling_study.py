@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 CRITERIA = {"effort": "effort_Ns", "time": "task_time_s", "force": "contact_force_overshoot_N"}
 #: Selections of equally weighted criteria.
-CRITERIA_BY_NAME = {"all": tuple(CRITERIA), **{name: (name,) for name in CRITERIA}}
+CRITERIA_BY_CHOICE = {"all": tuple(CRITERIA), **{name: (name,) for name in CRITERIA}}
 TASK_CRITERIA = dict.fromkeys(("reach", "touch", "press", "insert"), tuple(CRITERIA))
 """Criteria of each task; free reaching has no contact."""
 TASK_CRITERIA["reach"] = ("effort", "time")
@@ -69,7 +69,9 @@ def scaling_study_command(
         study_command(name, out / name, quiet=quiet, progress=progress, **options)
         rows[name] = Store(out / name / "runs.parquet").read()
     tables = {task: _criterion_tables(rows[f"scaling_{task}"], task) for task in TASK_CRITERIA}
-    ratings = {name: judge_scales(tables, criteria) for name, criteria in CRITERIA_BY_NAME.items()}
+    ratings = {
+        name: judge_scales(tables, criteria) for name, criteria in CRITERIA_BY_CHOICE.items()
+    }
     summary = {
         "runs": sum(table.height for table in rows.values()),
         "choice": {selection: _find_best_scales(rating) for selection, rating in ratings.items()},

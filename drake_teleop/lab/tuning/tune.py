@@ -44,7 +44,7 @@ _GAMMA_RATIO_AT_BISECTION_END = 1.15  # smallest unstable over largest stable ga
 _GAMMA_STEP_FACTOR_NEAR_NOISE_LIMIT = 1.03
 
 Row = dict[str, Any]
-RunStudy = Callable[[str, Study, Any], list[Row]]
+StudyRunner = Callable[[str, Study, Any], list[Row]]
 
 
 def tune(
@@ -128,7 +128,7 @@ class SearchResult:
     beyond_runs: list[Row]  #: runs with a larger gamma, then at stiffer walls
 
 
-def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult:
+def search_settings(trial: StationPressTrial, execute: StudyRunner) -> SearchResult:
     """Return the stable settings with which the operator detects the smallest contact force."""
     base, stated = trial.base_scenario, trial.operating_range
     margin = stated.requirements.loop_gain_margin
@@ -179,7 +179,7 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
 
 
 def _search_max_gamma(
-    settings: TunedSettings, trial: StationPressTrial, execute: RunStudy
+    settings: TunedSettings, trial: StationPressTrial, execute: StudyRunner
 ) -> tuple[float, list[Row]]:
     def all_meet_requirements(rows: list[Row]) -> bool:
         return all(meets_requirements(row, press_trial.MAX_SEARCH_FORCE_ERROR) for row in rows)
@@ -218,16 +218,20 @@ def meets_requirements(
     return bool(row["rests"] and row["rest_force_N"] <= MAX_REST_FORCE_N and exact)
 
 
-def make_study_executor(out: Path, inputs: dict[str, Any], jobs: int, progress: bool) -> RunStudy:
+def make_study_executor(
+    out: Path, inputs: dict[str, Any], jobs: int, progress: bool
+) -> StudyRunner:
     """Return a function that runs a named study in the folder `out` / name."""
 
-    def execute(name: str, study: Study, work: Any) -> list[Row]:
+    def execute(name: str, study: Study, run_function: Any) -> list[Row]:
         with show_progress(progress) as stage:
 
             def start_trials(_: str) -> UpdateProgress:
                 return stage(f"Trials {name}")
 
-            found = run_study(study, out / name, work, inputs, jobs=jobs, progress=start_trials)
+            found = run_study(
+                study, out / name, run_function, inputs, jobs=jobs, progress=start_trials
+            )
         for row in found.rows(named=True):
             if row["error"]:
                 raise DrakeTeleopError(str(row["error"]), where=f"tune:{name}")
