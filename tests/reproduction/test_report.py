@@ -91,7 +91,7 @@ def test_unreported_values_never_agree():
     [
         ("free_force.peak_raw_N", 130.0, "peak force at the slave", "not as set"),
         ("free_force.peak_raw_N", float("nan"), "peak force at the slave", "not as set"),
-        ("free_force.half_ratio", 0.6, "σ = 0.5 over σ = 1", "not as set"),
+        ("free_force.half_ratio", 0.6, "σ = 0.5 / σ = 1", "not as set"),
         ("free_force.residual_max_N", 5.1, "largest residual force", "differs"),
         (
             "ideal.residual_max_N",
@@ -105,11 +105,11 @@ def test_unreported_values_never_agree():
             "All axes, ideal sensor, true φ: residual t",
             "beyond our bound",
         ),
-        ("contact.detected_s", 0.2404, "detection delay in the contact force", "differs"),
-        ("contact.detected_s", 0.2154, "detection delay in the contact force", "differs"),
-        ("contact.raw_detectable", True, "threshold on the raw force", "differs"),
+        ("contact.detected_s", 0.2404, "delay from contact to detection", "differs"),
+        ("contact.detected_s", 0.2154, "delay from contact to detection", "differs"),
+        ("contact.raw_detectable", True, "raw force exceeds", "differs"),
         ("contact.false_alarm_0_6_s", True, "false alarm", "differs"),
-        ("contact.peak_contact_N", 90.0, "over inertial peak", "differs"),
+        ("contact.peak_contact_N", 90.0, "contact / inertial peak", "differs"),
         ("identification.mass_error_percent", 0.3, "Mass", "beyond our bound"),
     ],
 )
