@@ -44,8 +44,8 @@ from drake_teleop.lab.analysis.period_map import (
     SAMPLED_FORCE,
     Sampling,
     one_way_delay_in_hand_periods,
-    period_map_of_cut_loop,
     sampled_two_port,
+    transition_matrix_of_cut_loop,
 )
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.sensor.sensor_chain import butterworth_sections
@@ -240,7 +240,7 @@ def continuous_margin(axis: OneAxis) -> float:
 def grows(axis: OneAxis, sampling: Sampling) -> bool:
     """Return whether the closed loop with its registers has an eigenvalue outside |z| = 1."""
     M, registers = (
-        period_map_of_cut_loop(axis, sampling),
+        transition_matrix_of_cut_loop(axis, sampling),
         2 * one_way_delay_in_hand_periods(axis, sampling),
     )
     n = len(M) - 3

@@ -32,10 +32,10 @@ from stations import ARMS
 
 from drake_teleop.lab.analysis.analyze import (
     OMEGA,
-    UNIT_VECTORS,
+    UNIT_VECTOR_W_BY_AXIS,
     axis_with_grip,
     close_all_loops,
-    close_other_directions,
+    close_feedback_of_other_directions,
     sampling_of_scenario,
     stiffest_stable_walls,
 )
@@ -103,10 +103,13 @@ def station_of(arm: str, models: Path | None) -> Scenario:
 
 def figures(scenario: Scenario) -> dict[str, Any]:
     estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
-    along, sampling = task_direction(scenario, UNIT_VECTORS["z"]), sampling_of_scenario(scenario)
+    along, sampling = (
+        task_direction(scenario, UNIT_VECTOR_W_BY_AXIS["z"]),
+        sampling_of_scenario(scenario),
+    )
     free = linearize(scenario, load_estimate=estimate)
     with_hand = two_port_along(
-        close_other_directions(free, scenario, along), OMEGA, along.hand, along.tool
+        close_feedback_of_other_directions(free, scenario, along), OMEGA, along.hand, along.tool
     )
     axis = along.axis
     H = absorb_impedances(with_hand, hand=-1j * OMEGA * axis.hand_mass)

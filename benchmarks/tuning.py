@@ -38,8 +38,8 @@ from drake_teleop.lab.tuning.press_trial import (
     StationPressTrial,
     is_force_share_accepted,
     make_operating_range,
-    settings_from_values,
-    without_task_and_method,
+    settings_of_point,
+    without_task_and_passivity_method,
 )
 from drake_teleop.lab.tuning.tune import meets_requirements, tune
 from drake_teleop.station.master.data_sheets import Master
@@ -87,8 +87,8 @@ def station(asked: argparse.Namespace, seed: int) -> dict[str, Any]:
         row |= {"cpu_s": time.process_time() - cpu}
     row |= {"sentences": found["sentences"], **found["figures"]}
     values = found["settings"]
-    settings = settings_from_values(values)
-    base = without_task_and_method(scenario, network)
+    settings = settings_of_point(values)
+    base = without_task_and_passivity_method(scenario, network)
     search = OneAxisGammaSearch(base, stated, {})
     axis = OneAxisFromScenario(base, (0.0, 0.0, 1.0))
     axis = dataclasses.replace(axis, sigma=settings.sigma_inertia, wall_damping=0.0)

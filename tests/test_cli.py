@@ -278,7 +278,11 @@ def test_unaccepted_number_has_status_1(capsys, install, lines, status):
     install(
         "drake_teleop.lab.reproduction.reproduce", "reproduce_command", lambda *_, **__: "figures"
     )
-    install("drake_teleop.lab.reproduction.report", "describe_unaccepted", {"figures": lines}.get)
+    install(
+        "drake_teleop.lab.reproduction.report",
+        "describe_values_outside_ranges",
+        {"figures": lines}.get,
+    )
     assert run_main(capsys, "reproduce") == (status, "", "".join(f"{x}\n" for x in lines))
 
 
@@ -311,7 +315,9 @@ def test_options_reach_the_commands(capsys, install):
 
     install("drake_teleop.lab.run", "run_command", note)
     install("drake_teleop.lab.reproduction.reproduce", "reproduce_command", note)
-    install("drake_teleop.lab.reproduction.report", "describe_unaccepted", lambda summary: [])
+    install(
+        "drake_teleop.lab.reproduction.report", "describe_values_outside_ranges", lambda summary: []
+    )
     install("drake_teleop.cli.logs", "identify_command", note)
     status, out, err = run_main(
         capsys, "run", "contact_transition", "--seed", "7", "--fresh", "--quiet"

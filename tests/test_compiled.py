@@ -183,7 +183,7 @@ def test_call_at_calls_functions_and_propagates_exceptions():
 
 
 def test_other_argument_types_recompile_the_caller():
-    assert _compiled._fingerprint_text(_call) != _compiled._fingerprint_text(_call_other)
+    assert _compiled._text_for_fingerprint(_call) != _compiled._text_for_fingerprint(_call_other)
 
 
 def test_borrowing_function_fills_arrays_and_its_callee_allocates():

@@ -126,7 +126,7 @@ def test_run_keeps_its_scenario_and_a_recorded_drive(tmp_path, capsys):
     line = error_line(["run", own, "--out", tmp_path], capsys)
     assert "contains the input scenario.yaml, which the results would replace; give an" in line
     line = error_line(["run", own, "--out", drive], capsys)
-    assert "drive: contains a recorded drive, which the results would replace" in line
+    assert "drive: contains a recorded live session, which the results would replace" in line
     assert {path.read_text() for path in tmp_path.rglob("*.*")} == {"{}  # mine"}
 
 

@@ -274,7 +274,7 @@ def test_tilt_of_a_tool_that_cannot_be_vertical_is_stated(tmp_path, runs, monkey
     path = tmp_path / "five.sdf"
     path.write_text(ARM.read_text().replace('"joint_4" type="revolute"', '"joint_4" type="fixed"'))
     monkeypatch.setattr(place, "find_posture", lambda *each: (each[2], IkStatus.OUT_OF_REACH))
-    monkeypatch.setattr(place, "_can_reach_corner", lambda *_: True)
+    monkeypatch.setattr(place, "_can_reach_cube_corner", lambda *_: True)
     monkeypatch.setattr(place, "_NUM_SOLVED_POSTURES", 3)
     new_command(tmp_path / "mine", path, "sensor")
     start = NominalSlave(LoadScenario(tmp_path / "mine" / "station.yaml").slave)

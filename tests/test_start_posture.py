@@ -229,7 +229,9 @@ def test_gripper_that_cannot_point_down_is_not_called_down(tmp_path):
     plan = plan_station(path, "ft")
     assert plan.has_own_tool and plan.direction_at_start == "-z_S down"
     (text,) = [text for text in plan.assumptions if "away from the arm" in text]
-    assert text.startswith("-z_S downwards at the start, as no posture was found in which x_S")
+    assert text.startswith(
+        "-z_S points down at the start, because no posture was found in which x_S"
+    )
     assert plan.tool_axis_advice.startswith("-z_S points down, so")
     model = {"model": str(path), "sensor_frame": "ft"}
     written = scenario_text(plan, model, None, PHANTOM_NAME, None)

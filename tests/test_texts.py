@@ -36,7 +36,7 @@ ALL_READERS = {
     "brackets": ("a: " + "[" * 2000 + "]" * 2000, "nested too deeply"),
     "braces": ("{a: " * 2000 + "1" + "}" * 2000, "nested too deeply"),
     "its own alias": ("a: &a [*a]", "nested too deeply"),
-    "aliases of aliases": (ALIASES, "there are more than 50000 values"),
+    "aliases of aliases": (ALIASES, "the file has more than 50000 values"),
     "the name of a tag": ("operator: {task: {_tag: 3}}", ":operator.task._tag: there is no such"),
     "code": ("a: !!python/object/apply:os.system [ls]", ":a: a list cannot have the tag"),
     "bytes": ("a: !!binary aGk=", ":a: 'aGk=' does not match the tag 'binary'"),
@@ -178,7 +178,9 @@ def identified():
 def test_huge_file_is_not_read_completely(monkeypatch, tmp_path):
     monkeypatch.setattr("drake_teleop.common.texts._MAX_YAML_VALUES", 100)
     path = tmp_path / "x.yaml"
-    expected = "(line 201: there are more than 100 values)"  # but not a bracket that is not closed
+    expected = (
+        "(line 201: the file has more than 100 values)"  # but not a bracket that is not closed
+    )
     assert expected in message(read_yaml, path, "- 1\n" * 250 + "[")
 
 

@@ -52,10 +52,10 @@ def reproduce(out: Path, **options: Any) -> int:
     Writes figures and numbers of the paper (Kubus, Weidauer, Wahl 2009) and of the simulation, a
     3D replay and report.html. The exit status is 1 if a number is outside its accepted range.
     """
-    from drake_teleop.lab.reproduction.report import describe_unaccepted
+    from drake_teleop.lab.reproduction.report import describe_values_outside_ranges
     from drake_teleop.lab.reproduction.reproduce import reproduce_command
 
-    lines = describe_unaccepted(reproduce_command(out, **options))
+    lines = describe_values_outside_ranges(reproduce_command(out, **options))
     for line in lines:
         click.echo(line, err=True)
     return 1 if lines else 0

@@ -15,7 +15,7 @@ NO_EXTRA_SLOTS: tuple[str, ...] = ()
 
 
 def weak_callback(method: Any) -> Callable[..., None]:
-    """Return a callback that calls `method` but does not keep its system alive."""
+    """Return a callback that calls a system's method but does not keep the system alive."""
     system, function = weakref.ref(method.__self__), method.__func__
 
     def call_method(context: Any, output: Any) -> None:
@@ -42,7 +42,7 @@ LARGEST_PORT_VALUE = 1e6
 
 
 class Fault(IntEnum):
-    """Faults that suppress the force at the operator's hand; of several the lowest code counts."""
+    """Codes of faults that suppress the force at the hand; the lowest active code is reported."""
 
     NONE = 0
     OLD_SAMPLE = 1
@@ -64,7 +64,7 @@ FAULT_WARNINGS = {
     Fault.HAND_JOINTS: f"the hand's joint angles are {_PORT_VALUE_OUT_OF_RANGE_TEXT}",
     Fault.RESUMING: "the force at the hand increases again after a fault",
 }
-"""Warning text of each fault."""
+"""Warning text by fault."""
 
 
 @njit(cache=True)

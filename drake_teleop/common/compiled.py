@@ -25,7 +25,7 @@ from numba.extending import intrinsic
 
 from drake_teleop.common.errors import DrakeTeleopError
 
-_TYPES_IDENTIFIED_BY_REPR = (
+_CONSTANT_TYPES_HASHED_BY_REPR = (
     *(int, float, complex, str, bytes, slice, type(None), type(...)),
     *(np.dtype, np.generic),
 )
@@ -34,7 +34,7 @@ _TYPES_IDENTIFIED_BY_REPR = (
 def njit(*, omits_reference_counting: bool = False, **options: Any) -> Callable[[Any], Any]:
     """Return a decorator like `numba.njit`; with `cache=True` it stores the machine code on disk.
 
-    With `omits_reference_counting` the function must create no arrays.
+    `omits_reference_counting` gives faster code, but the function must create no arrays.
     """
     # Set in either case, because callees inherit unset options.
     options["_nrt"] = not omits_reference_counting
@@ -53,11 +53,11 @@ def njit(*, omits_reference_counting: bool = False, **options: Any) -> Callable[
 
 
 def make_call_at_address(arguments: tuple[types.Type, ...]) -> Any:
-    """Return a compiled f(address, values) that calls machine code with these argument types."""
+    """Return a compiled function of the address and arguments of machine code, which it calls."""
 
     @intrinsic
     def call(_typing_context: Any, _address: Any, *_arguments: Any) -> Any:
-        def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        def generate_code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
             address, packed = values
             pairs = zip(cgutils.unpack_tuple(builder, packed), signature.args[1], strict=True)
             cast = [
@@ -73,7 +73,7 @@ def make_call_at_address(arguments: tuple[types.Type, ...]) -> Any:
                 context.call_conv.return_status_propagate(builder, status)
             return context.get_dummy_value()
 
-        return types.void(types.int64, types.StarArgTuple(_arguments)), code
+        return types.void(types.int64, types.StarArgTuple(_arguments)), generate_code
 
     call.__qualname__ = f"call_at{arguments}"  # part of the caller's fingerprint
     return call
@@ -131,33 +131,33 @@ class _CacheFiles:
                 path.unlink(missing_ok=True)
 
 
-def _is_trusted_file(status: os.stat_result) -> bool:
+def _is_trusted_file(file_status: os.stat_result) -> bool:
     owners = {os.getuid(), 0, Path(__file__).stat().st_uid}
-    return status.st_uid in owners and not status.st_mode & stat.S_IWOTH
+    return file_status.st_uid in owners and not file_status.st_mode & stat.S_IWOTH
 
 
 def fingerprint_of_code(dispatcher: Dispatcher) -> str:
     found: set[Any] = {dispatcher}
     pending: list[Any] = [dispatcher]
     while pending:
-        called = _fingerprint_text_and_callees(pending.pop())[1] - found
+        called = _text_for_fingerprint_and_callees(pending.pop())[1] - found
         found |= called
         pending.extend(called)
-    texts = sorted(_fingerprint_text_and_callees(each)[0] for each in found)
+    texts = sorted(_text_for_fingerprint_and_callees(each)[0] for each in found)
     return sha256("\n".join(texts).encode()).hexdigest()[:16]
 
 
 @cache
-def _fingerprint_text_and_callees(compiled: Any) -> tuple[str, frozenset[Any]]:
+def _text_for_fingerprint_and_callees(compiled: Any) -> tuple[str, frozenset[Any]]:
     function = getattr(compiled, "py_func", compiled)
     constants = dict(_values_referenced_by(function))
     options = getattr(compiled, "targetoptions", {})
     text = (
         _qualified_name(compiled),
-        _fingerprint_text(function.__code__),
-        _fingerprint_text(function.__defaults__),
+        _text_for_fingerprint(function.__code__),
+        _text_for_fingerprint(function.__defaults__),
         sorted((name, str(option)) for name, option in options.items()),
-        sorted((name, _fingerprint_text(value)) for name, value in constants.items()),
+        sorted((name, _text_for_fingerprint(value)) for name, value in constants.items()),
     )
     package = function.__module__.partition(".")[0]
     callees = (value for value in constants.values() if _is_callee(value, package))
@@ -193,22 +193,22 @@ def _names_referenced_by_code(code: CodeType) -> Iterator[str]:
             yield from _names_referenced_by_code(constant)
 
 
-def _fingerprint_text(value: Any) -> str:
+def _text_for_fingerprint(value: Any) -> str:
     if isinstance(value, CodeType):
         parts = [value.co_code, value.co_names, value.co_varnames, value.co_argcount]
         # Since Python 3.11 exception handlers are in a separate table.
         parts += [value.co_freevars, getattr(value, "co_exceptiontable", b"")]
-        return repr((parts, _fingerprint_text(value.co_consts)))
+        return repr((parts, _text_for_fingerprint(value.co_consts)))
     if isinstance(value, tuple):
-        return f"{type(value).__name__}{[_fingerprint_text(each) for each in value]}"
+        return f"{type(value).__name__}{[_text_for_fingerprint(each) for each in value]}"
     if isinstance(value, np.ndarray):
         return repr((value.dtype, value.shape, value.tobytes()))
     if isinstance(value, (Dispatcher, ModuleType)) or callable(value):
         return _qualified_name(value)
-    if isinstance(value, _TYPES_IDENTIFIED_BY_REPR):
+    if isinstance(value, _CONSTANT_TYPES_HASHED_BY_REPR):
         return repr(value)
-    what = f"a cached compiled function uses {value!r}, whose changes are not detected"
-    raise TypeError(f"{what}; pass it to the function as an argument")
+    what = f"a cached compiled function uses {value!r}"
+    raise TypeError(f"{what}, whose changes are not detected; pass this value as an argument")
 
 
 def _qualified_name(value: Any) -> str:

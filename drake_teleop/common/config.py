@@ -23,16 +23,16 @@ from drake_teleop.common.registry import Registry
 
 TYPE_NAMES = {float: "a number", int: "a whole number", bool: "true or false", str: "a word"}
 """Name of each value type in messages."""
-_assignment_checks_enabled = ContextVar("checks_assignments", default=True)
+_ARE_ASSIGNMENTS_CHECKED = ContextVar("checks_assignments", default=True)
 
 
 def quantity(
     default: Any, unit: str, low: float, high: float, doc: str, *, length: int | None = None
 ) -> Any:
-    """Return a dataclass field for a number, or for a list or mapping of numbers, as `default` is.
+    """Return a dataclass field for a number, list or mapping of numbers, like its default.
 
     `unit` is an SI unit, "1" if dimensionless; each number must be from `low` to `high`. A list
-    has the length of its default; after [] any length; after None `length`.
+    has the length of its default. Default [] allows any length, default None `length` numbers.
     """
     metadata = {"unit": unit, "low": low, "high": high, "doc": doc, "length": length}
     if isinstance(default, list) and default:
@@ -67,18 +67,18 @@ def plain(
 def with_absolute_paths(config: Any, folder: Path) -> Any:
     """Return a copy of a dataclass whose paths, relative to `folder`, are absolute, at any depth.
 
-    A default path is a shipped model; it changes only if `folder` contains such a file.
+    Default paths of shipped models remain, unless `folder` contains a file of this name.
     """
 
-    def resolve_paths(value: Any, entry: dataclasses.Field[Any]) -> Any:
+    def resolve_paths(value: Any, field: dataclasses.Field[Any]) -> Any:
         if isinstance(value, list):
-            return [resolve_paths(item, entry) for item in value]
+            return [resolve_paths(item, field) for item in value]
         if dataclasses.is_dataclass(value):
             return with_absolute_paths(value, folder)
-        if not entry.metadata.get("is_path") or not value:
+        if not field.metadata.get("is_path") or not value:
             return value
         path = (folder / value).resolve()
-        return value if value == entry.default and not os.path.isfile(path) else str(path)
+        return value if value == field.default and not os.path.isfile(path) else str(path)
 
     changes = {}
     for entry in dataclasses.fields(config):
@@ -100,7 +100,7 @@ def shorten_value(value: Any) -> str:
 def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False) -> None:
     """Raise DrakeTeleopError if parsed YAML does not fit the fields and types of a dataclass.
 
-    `tagged` allows the key "_tag" with a YAML tag.
+    `where` is the place in messages; `tagged` allows a YAML tag, as the key "_tag".
     """
     if not isinstance(data, dict):
         what = f"expected a mapping of fields, found {shorten_value(data)}"
@@ -208,9 +208,9 @@ def _field_names(schema: type) -> list[str]:
 
 
 class FieldType(NamedTuple):
-    """Structure of a type: for `list[A | B] | None`, depth 1, items A and B, optional True.
+    """Parsed type hint: `list[A | B] | None` has list depth 1, items (A, B) and is optional.
 
-    `is_mapping` is True for `dict[str, A]`, a mapping of names to items.
+    `is_mapping` is True for `dict[str, A]`.
     """
 
     list_depth: int
@@ -239,7 +239,7 @@ def _check_value_type(kind: FieldType, value: Any, where: str, *, from_file: boo
         return
     if kind.is_mapping:
         if not isinstance(value, dict) or "_tag" in value:
-            raise _make_type_error("a mapping of names", value, where, "write {name: value}")
+            raise _make_type_error("names with values", value, where, "write {name: value}")
         for name, item in value.items():
             inner = kind._replace(is_mapping=False)
             _check_value_type(inner, item, f"{where}.{name}", from_file=from_file)
@@ -256,7 +256,7 @@ def _check_value_type(kind: FieldType, value: Any, where: str, *, from_file: boo
             raise _make_type_error(TYPE_NAMES[first], value, where, remedy)
     elif from_file:
         several = len(kind.items) > 1
-        check_structure(_block_class_of_tag(kind.items, value, where), value, where, tagged=several)
+        check_structure(_class_of_yaml_tag(kind.items, value, where), value, where, tagged=several)
     elif not isinstance(value, kind.items):
         fields = ", ".join(_field_names(first))
         remedy = f"pass {first.__name__}(...) with fields {fields}"
@@ -264,7 +264,7 @@ def _check_value_type(kind: FieldType, value: Any, where: str, *, from_file: boo
         raise _make_type_error(expected, value, where, remedy)
 
 
-def _block_class_of_tag(blocks: tuple[type, ...], value: Any, where: str) -> type:
+def _class_of_yaml_tag(blocks: tuple[type, ...], value: Any, where: str) -> type:
     names = [block.__name__ for block in blocks]
     tag = str(value.get("_tag", "")).removeprefix("!") if isinstance(value, dict) else ""
     if tag and tag not in names:
@@ -302,8 +302,8 @@ class FieldInfo:
     """Description of a dataclass field.
 
     Attributes:
-        kind: "number", "whole number", "true or false", "word" or "block" (a dataclass); for a
-            list or mapping, the kind of its items.
+        kind: "number", "whole number", "true or false", "word" or "block" (a dataclass); of the
+            items of a list or mapping.
         list_depth: number of nested lists, 0 for one value.
         is_mapping: True if the value maps names to items.
         unit: "1" for a dimensionless quantity; empty if the field is no quantity.
@@ -379,7 +379,7 @@ def _set_checked_attribute(self: Any, name: str, value: Any) -> None:
     # Drake's `yaml_load_typed` sets an optional field to float(), list() etc. before the value of
     # the file. Such a value is checked again when a station is made.
     is_created = getattr(self, name, value) is None and not value
-    if _assignment_checks_enabled.get() and not is_created:
+    if _ARE_ASSIGNMENTS_CHECKED.get() and not is_created:
         check_field(type(self), name, value, place)
     else:
         check_field_name(type(self), name, place)
@@ -388,11 +388,11 @@ def _set_checked_attribute(self: Any, name: str, value: Any) -> None:
 
 @contextmanager
 def unchecked_assignments() -> Iterator[None]:
-    token = _assignment_checks_enabled.set(False)
+    token = _ARE_ASSIGNMENTS_CHECKED.set(False)
     try:
         yield
     finally:
-        _assignment_checks_enabled.reset(token)
+        _ARE_ASSIGNMENTS_CHECKED.reset(token)
 
 
 def fields_of(config: Any) -> list[FieldInfo]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from threading import RLock
 from typing import Any
 
-_FIRST_POLARS_PROCESS_ID: list[int] = []  # PID of the process that first used polars
+_ID_OF_FIRST_PROCESS_WITH_POLARS: list[int] = []  # PID of the process that first used polars
 
 MAX_ERROR_LINE_LENGTH = 1000
 """Maximum length of an error line of the command line."""
@@ -44,7 +44,7 @@ def to_one_line(text: str, max_length: int = MAX_ERROR_LINE_LENGTH) -> str:
 
 
 def expect_type(kind: type | tuple[type, ...], value: Any, where: str, remedy: str = "") -> None:
-    """Raise DrakeTeleopError for argument `where` unless the value has type `kind`."""
+    """Raise DrakeTeleopError unless the value of the argument named `where` has type `kind`."""
     if not isinstance(value, kind):
         kinds = kind if isinstance(kind, tuple) else (kind,)
         expected = " or ".join("None" if one is type(None) else one.__name__ for one in kinds)
@@ -69,9 +69,9 @@ def wrap_read_errors(path: str | Path, remedy: str, what: str = "cannot be read"
 
 def refuse_polars_in_forked_process() -> None:
     """Raise DrakeTeleopError in a process forked after the first call: polars would hang there."""
-    _FIRST_POLARS_PROCESS_ID.append(os.getpid())
-    del _FIRST_POLARS_PROCESS_ID[1:]
-    if [os.getpid()] != _FIRST_POLARS_PROCESS_ID:
+    _ID_OF_FIRST_PROCESS_WITH_POLARS.append(os.getpid())
+    del _ID_OF_FIRST_PROCESS_WITH_POLARS[1:]
+    if [os.getpid()] != _ID_OF_FIRST_PROCESS_WITH_POLARS:
         what = "would hang in this process, which was forked after polars was used"
         remedy = 'start processes by multiprocessing.get_context("spawn")'
         raise DrakeTeleopError(what, where="polars", remedy=remedy)

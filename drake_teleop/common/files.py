@@ -23,9 +23,9 @@ _MAX_LISTED_FILES = 6
 _RUST_OS_ERROR_PATTERN = re.compile(r"([^:]+) \(os error \d+\)")
 
 _LOG_PART_NAME_FORMAT = "row_{:010d}.parquet"
-LOG_PARTS_PATTERN = _LOG_PART_NAME_FORMAT.format(0).replace("0", "?")
+LOG_PARTS_GLOB = _LOG_PART_NAME_FORMAT.format(0).replace("0", "?")
 DRIVE_INPUTS_FILE_NAME = "inputs.csv"
-"""Name of the file with the inputs of a recorded drive."""
+"""Name of the file with the inputs of a recorded live session."""
 
 
 class CannotWrite(DrakeTeleopError):
@@ -38,8 +38,8 @@ def replace_file_on_success(
 ) -> Iterator[Path]:
     """Yield a temporary path to write to; then rename this file to `path`.
 
-    After a failure `path` is unchanged. The temporary path extends that of `temporary_base`, by
-    default `path`. `shared` allows several writing processes.
+    After a failure `path` is unchanged. The temporary file is `temporary_base` (default: `path`)
+    plus a suffix, which is unique if processes write a `shared` path.
     """
     place, ending = temporary_base or path, uuid4().hex if shared else "unfinished"
     temporary = place.with_name(f"{place.name}.{ending}")
@@ -80,7 +80,7 @@ def write_picture(path: Path, figure: Figure, **options: Any) -> None:
 def write_table(
     path: Path, table: pl.DataFrame, *, temporary_base: Path | None = None, **options: Any
 ) -> None:
-    """Write a table as CSV if `path` ends with .csv, else Parquet, with `options` of polars."""
+    """Write a table as CSV if `path` ends with .csv, else Parquet; polars gets other options."""
     import polars as pl
 
     refuse_polars_in_forked_process()
@@ -96,9 +96,9 @@ def write_table(
 def output_folder(
     out: Path, completion_file: str = "summary.json", *, valid_after_failure: Sequence[str] = ()
 ) -> Iterator[None]:
-    """Create `out` and remove its `completion_file`, which this context then writes last.
+    """Create `out` and remove its `completion_file`, which the caller must write last.
 
-    A CannotWrite error lists the valid files: new ones, and those in `valid_after_failure`.
+    A CannotWrite error lists the valid files: new ones, and names in `valid_after_failure`.
     """
     make_folder(out)
     with wrap_write_errors(out / completion_file):
@@ -113,13 +113,13 @@ def output_folder(
 
 
 def refuse_to_replace_inputs(path: Path, *input_paths: str | Path) -> None:
-    """Raise DrakeTeleopError if `path` is one of `input_paths` or a file of a recorded drive.
+    """Raise DrakeTeleopError if `path` is an input or a file of a recorded live session.
 
-    Missing files, such as shipped names, are ignored.
+    Inputs that are no files, such as names of shipped scenarios, are ignored.
     """
     if not path.exists():
         return
-    what = "a recorded drive" if (path.parent / DRIVE_INPUTS_FILE_NAME).exists() else ""
+    what = "a recorded live session" if (path.parent / DRIVE_INPUTS_FILE_NAME).exists() else ""
     if any(os.path.exists(x) and os.path.samefile(x, path) for x in input_paths):
         what = f"the input {path.name}"
     if what:
@@ -161,7 +161,7 @@ def remove_log(path: Path) -> None:
     if not path.is_dir():
         path.unlink(missing_ok=True)
         return
-    parts = sorted(path.glob(LOG_PARTS_PATTERN))
+    parts = sorted(path.glob(LOG_PARTS_GLOB))
     if others := sorted(set(path.iterdir()) - set(parts)):
         what = f"contains {others[0].name}, which is not part of a log"
         raise DrakeTeleopError(what, where=str(path), remedy="give another folder for the log")

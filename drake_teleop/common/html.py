@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def render_page(package: str, template: str, **values: Any) -> str:
     """Return the page of a Jinja template in `package`, which may extend page.html.j2.
 
-    `values` are escaped; a missing value is an error.
+    The keyword arguments are the template's variables; HTML in them is escaped.
     """
 
     def read_template(name: str) -> str:
@@ -42,7 +42,7 @@ def png_data_url(path: Path) -> str:
 def write_report_page_and_pictures(
     out: Path, package: str, pictures: Mapping[str, Figure], **values: Any
 ) -> None:
-    """Write NAME.png for each picture, and report.html; its template gets the data URLs."""
+    """Write NAME.png for each figure, and report.html from the package's report.html.j2."""
     from drake_teleop.common.style import PAGE_DPI
 
     for name, figure in pictures.items():

@@ -28,7 +28,7 @@ def install_interrupt_handlers() -> None:
 
 @contextmanager
 def raise_interrupt_on_sigint() -> Iterator[None]:
-    """Handle SIGINT in this context as `install_interrupt_handlers`, if Python's handler is set."""
+    """Let SIGINT set INTERRUPTED_EVENT in this context, unless a custom handler is set."""
     before = signal.getsignal(signal.SIGINT)
     in_main_thread = threading.current_thread() is threading.main_thread()
     if before is not signal.default_int_handler or not in_main_thread:

@@ -11,7 +11,7 @@ from drake_teleop.common.compiled import njit
 
 @njit(cache=True)
 def random_bits(key, counter):
-    """Return 53 random bits from np.uint64 `key` and int `counter`: splitmix64 (Steele 2014)."""
+    """Return 53 random bits (np.uint64) of a key (np.uint64) and counter (splitmix64, 2014)."""
     z = key + np.uint64(counter + 1) * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

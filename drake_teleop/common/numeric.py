@@ -21,7 +21,7 @@ MAX_ARRAY_VALUE = 1e30
 
 
 def finite_array(name: str, value: ArrayLike, *shape: int, leading: bool = False) -> Array:
-    """Return `value` as a float64 array of this shape, within +-`MAX_ARRAY_VALUE`; else raise.
+    """Return `value` as a float64 array; raise DrakeTeleopError for another shape, NaN or > 1e30.
 
     `leading` allows more dimensions in front; `name` is for the message.
     """
@@ -50,7 +50,7 @@ def float_array(name: str, value: ArrayLike, remedy: str = "") -> Array:
         if np.iscomplexobj(value) or np.ma.is_masked(value):
             raise ValueError("complex" if np.iscomplexobj(value) else "masked")
         if np.asarray(value).dtype.kind in "mMSU":
-            raise ValueError("dates, time spans or texts")
+            raise ValueError("its values are dates, time spans or texts")
         return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         what = f"contains no real numbers ({error})"
@@ -58,13 +58,13 @@ def float_array(name: str, value: ArrayLike, remedy: str = "") -> Array:
 
 
 def as_compiled_arguments(values: _Record) -> _Record:
-    """Return a named tuple with each number as a float and each vector as a float64 array."""
+    """Return a named tuple with its numbers as floats and its vectors as float64 arrays."""
     numbers = (np.array(value, float) if np.ndim(value) else float(value) for value in values)
     return values._make(numbers)
 
 
 def pack_for_compiled_code(**values: ArrayLike) -> Records:
-    """Return values as float64 fields of a record array (1,), fast to pass to compiled code."""
+    """Return keyword arguments as float64 fields of a record array (1,) for compiled code."""
     arrays = {name: np.asarray(value, float) for name, value in values.items()}
     fields = [(name, float, array.shape) for name, array in arrays.items()]
     packed: Records = np.zeros(1, np.dtype((np.record, fields)))
@@ -74,7 +74,7 @@ def pack_for_compiled_code(**values: ArrayLike) -> Records:
 
 
 def broadcast_to_rows(**arrays: tuple[ArrayLike, int]) -> tuple[tuple[int, ...], list[Array]]:
-    """Broadcast arrays (..., n), given as name=(array, n); return leading shape, tables (N, n)."""
+    """Broadcast keyword arguments name=(array (..., n), n); return leading shape, arrays (N, n)."""
     tables = {
         name: finite_array(name, value, n, leading=True) for name, (value, n) in arrays.items()
     }
@@ -147,7 +147,7 @@ def find_runs_of_true(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
     return np.flatnonzero(np.diff(np.concatenate([ends, flags, ends]))).reshape(-1, 2)
 
 
-def samples_to_nearest_flag(flags: NDArray[np.bool_]) -> Array:
+def samples_to_nearest_true(flags: NDArray[np.bool_]) -> Array:
     """Return for each sample (N,) the distance in samples to the nearest True; inf without one."""
     at = np.arange(len(flags), dtype=float)
     before = np.maximum.accumulate(np.where(flags, at, -np.inf))
@@ -181,7 +181,7 @@ def position_of_parabola_minimum(left: float, middle: float, right: float) -> fl
 
 
 def search_minimum(cost: Callable[[float], float], step: float, reach: float) -> tuple[float, bool]:
-    """Return the argument of the least cost, and False if it is an end of the search grid.
+    """Return the argument of the least cost, and True if it is inside the search grid.
 
     The grid has steps of `step` from -`reach` to `reach`; a parabola refines the argument.
     """
@@ -195,7 +195,7 @@ def search_minimum(cost: Callable[[float], float], step: float, reach: float) ->
 
 
 def white_noise_deviations(x: Array) -> Array:
-    """Return standard deviations (k,) of white noise in smooth signals x (N, k); 0 for N < 4."""
+    """Return std (k,) of white noise in smooth x (N, k) by third differences; 0 for N < 4."""
     if len(x) < 4:
         return np.zeros(x.shape[1:])
     # Third differences, whose factors 1, 3, 3, 1 have the square sum 20. The deviation of a normal

@@ -43,7 +43,7 @@ def _check_footer_and_columns(content: bytes | mmap.mmap) -> None:
     start = end - int.from_bytes(content[end : end + 4], "little")
     _require(start >= len(_PARQUET_MAGIC), "its footer is longer than the file")
     footer = _ThriftReader(content[start:end]).read_struct()
-    columns = list(_read_column_names_and_flatness(footer[2]))
+    columns = list(_read_column_names_and_flat_flags(footer[2]))
     groups = footer.get(4, [])
     rows = [_read_size(group, 3, "rows in a row group") for group in groups]
     same_rows = _read_size(footer, 3, "rows") == sum(rows)
@@ -54,7 +54,7 @@ def _check_footer_and_columns(content: bytes | mmap.mmap) -> None:
             _check_column_chunk(content, start, chunk[3], name, count if is_flat else None)
 
 
-def _read_column_names_and_flatness(schema: list[_ThriftStruct]) -> Iterator[tuple[str, bool]]:
+def _read_column_names_and_flat_flags(schema: list[_ThriftStruct]) -> Iterator[tuple[str, bool]]:
     above = [(len(schema), True)]  # of each enclosing group: remaining children, is flat
     for element in schema:
         while above[-1][0] == 0:
@@ -72,7 +72,7 @@ def _check_column_chunk(
     content: bytes | mmap.mmap, data_end: int, column: _ThriftStruct, name: str, rows: int | None
 ) -> None:
     values = _read_size(column, 5, f"values in {name}")
-    _require(rows in (None, values), f"{name} has {values} values in {rows} rows")
+    _require(rows in (None, values), f"column {name} has {values} values but {rows} rows")
     largest = _read_size(column, 6, f"bytes in {name}")
     length = _read_size(column, 7, f"bytes in {name}")
     at = _read_size(column, 9, f"the first byte of {name}")
@@ -97,16 +97,16 @@ def _count_values_of_page(page: _ThriftStruct, length: int, where: str) -> int:
         return _read_size(page[5], 1, what)
     if kind == _DICTIONARY_PAGE_TYPE:
         values = _read_size(page[7], 1, what)
-        _require(values <= page[2], f"{where} has fewer bytes than values")
+        _require(values <= page[2], f"{where} has only {page[2]} bytes for {values} values")
     if kind != _DATA_PAGE_V2_TYPE:
         return 0
     header = page[8]
     values = _read_size(header, 1, what)
     for number, name in ((2, "nulls"), (3, "rows")):
         size = _read_size(header, number, f"{name} in {where}")
-        _require(size <= values, f"{where} has more {name} than values")
+        _require(size <= values, f"{where} has {size} {name} but only {values} values")
     levels = sum(_read_size(header, number, f"bytes in {where}") for number in (5, 6))
-    _require(levels <= length, f"{where} is shorter than the level data in it")
+    _require(levels <= length, f"{where} has {length} bytes, but its null flags have {levels}")
     return values
 
 

@@ -21,7 +21,7 @@ def show_no_progress(name: str) -> UpdateProgress:
 
 @contextmanager
 def show_progress(progress: bool | StartStage, *, after: float = 0.0) -> Iterator[StartStage]:
-    """Yield a `StartStage` that shows progress, from `after` seconds on; or `progress` itself."""
+    """Yield `progress`, or for True a function that displays stages lasting over `after` s."""
     if callable(progress):
         yield progress
     elif not progress:

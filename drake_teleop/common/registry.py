@@ -49,7 +49,7 @@ class Registry(dict[str, _Part]):
         REGISTRIES[kind] = self
 
     def register(self, name: str, part: _Part | None = None) -> Any:
-        """Add a part, or return a decorator that does; it replaces an added part of this name."""
+        """Add or replace a part, except shipped ones; without `part`, return a decorator for it."""
         if part is None:
             return partial(self.register, name)
         if not isinstance(name, str) or not re.fullmatch(r"[.\w][\w.-]*", name, re.ASCII):
@@ -85,7 +85,7 @@ class Registry(dict[str, _Part]):
         if isinstance(name, str) and (name in others or name in self):
             return name
         names = (*others, *self)
-        remedy = suggest_name(name, names, f"choose one of {', '.join(names)}, or register it")
+        remedy = suggest_name(name, names, f"choose one of {', '.join(names)}, or register a part")
         raise DrakeTeleopError(f"there is no {self.kind} {name!r}", where=where, remedy=remedy)
 
     def __contains__(self, name: object) -> bool:

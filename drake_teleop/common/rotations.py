@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 
-NUM_COLUMNS_OF_ROTATION_FORM = {
+NUM_COLUMNS_BY_ROTATION_FORM = {
     "matrix": 9,
     "quaternion_wxyz": 4,
     "quaternion_xyzw": 4,
@@ -27,10 +27,10 @@ EULER_AXIS_SEQUENCES = tuple(
 
 
 def rotation_matrices(columns: Array, form: str, axes: str | None = None) -> Array:
-    """Return rotation matrices (N, 3, 3) of `columns` (N, k) in a `form`, without normalization.
+    """Return rotation matrices (N, 3, 3) of table columns (N, k), without normalization.
 
-    The forms are in `NUM_COLUMNS_OF_ROTATION_FORM`: matrices row by row, angles in rad. `axes` is
-    one of `EULER_AXIS_SEQUENCES`.
+    `form` is a key of `NUM_COLUMNS_BY_ROTATION_FORM`: matrices row by row, angles in rad. The form
+    "euler" needs `axes`, such as "xyz" (fixed) or "XYZ" (moving).
     """
     if form == "euler":
         from scipy.spatial.transform import Rotation

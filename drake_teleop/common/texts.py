@@ -48,7 +48,7 @@ class _YamlLoader(yaml.SafeLoader):
         # Refuses more than _MAX_YAML_VALUES values, to stop reading a huge file early.
         self.nodes = getattr(self, "nodes", 0) + 1
         if self.nodes > 2 * _MAX_YAML_VALUES:  # names are nodes too
-            what = f"there are more than {_MAX_YAML_VALUES} values"
+            what = f"the file has more than {_MAX_YAML_VALUES} values"
             raise yaml.composer.ComposerError(None, None, what, self.get_mark())
         return super().compose_node(parent, index)
 
@@ -74,7 +74,7 @@ for _kind, _, _first in _YAML_CORE_SCHEMA:
 
 
 def read_yaml(path: str | Path, *, tagged: bool = False) -> Any:
-    """Return a YAML file's data; `tagged`: tags of mappings become key "_tag", else errors."""
+    """Return a YAML file's data; with `tagged`, tags become keys "_tag" instead of errors."""
     return parse_yaml(read_text(path), str(path), tagged=tagged)
 
 
@@ -117,7 +117,7 @@ def to_yaml_text(
 
 
 def format_yaml_value(value: Any, flow: bool | None = True) -> str:
-    """Return a value as YAML in one line; with `flow` None, nested mappings have several lines."""
+    """Return a value as YAML in one line; without `flow`, nested mappings have several lines."""
     options: dict[str, Any] = {"Dumper": _YamlDumper, "allow_unicode": True, "sort_keys": False}
     text: str = yaml.dump(value, default_flow_style=flow, width=math.inf, **options)
     return text.removesuffix("...\n").strip("\n")
@@ -167,7 +167,7 @@ class _YamlNodeConverter:
     def convert_node(self, node: Any, where: str) -> Any:
         self._values += 1
         if self._values > _MAX_YAML_VALUES:
-            raise _error_at_node(f"there are more than {_MAX_YAML_VALUES} values", node, where)
+            raise _error_at_node(f"the file has more than {_MAX_YAML_VALUES} values", node, where)
         if isinstance(node, yaml.MappingNode):
             return self._convert_mapping(node, where)
         if isinstance(node, yaml.SequenceNode):

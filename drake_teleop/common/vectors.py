@@ -1,4 +1,4 @@
-"""Vectors of 3, rotation matrices of 9 numbers (by rows) and unit quaternions for compiled code.
+"""Vectors (3 numbers), rotation matrices (9, by rows) and unit quaternions for compiled code.
 
 The functions allocate no memory. Quaternions are tuples (w, x, y, z).
 """
@@ -108,7 +108,7 @@ def symmetric_matrix_at(x, i):
 
 @register_jitable(inline="always")
 def cholesky(M, n):
-    """Replace the lower triangle of a positive definite M (n, n) by L of M = L L^T."""
+    """Replace the lower triangle of positive definite M (n, n), only, by L of M = L L^T."""
     for i in range(n):
         for j in range(i + 1):
             value = M[i, j]

@@ -201,7 +201,7 @@ def _get_motion_and_kappa(scenario: Scenario, stage: StartStage) -> tuple[Fourie
 def _check_given_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: float) -> None:
     if len(trajectory.q0) != robot.arm.num_joints:
         what = f"has {len(trajectory.q0)} joints, but the arm has {robot.arm.num_joints}"
-        raise DrakeTeleopError(what, where="trajectory", remedy="compute a trajectory for this arm")
+        raise DrakeTeleopError(what, where="trajectory", remedy="run excite for this arm")
     if not np.isclose(trajectory.period, duration, rtol=1e-9):
         what = f"has a period of {trajectory.period:g} s, but the simulation lasts {duration:g} s"
         remedy = "set simulation.duration to the period"

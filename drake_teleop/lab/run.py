@@ -64,8 +64,7 @@ class RecordedDrive(Protocol):
     """Recorded live session that can be simulated again."""
 
     @property
-    def folder(self) -> Path:
-        """Folder of the recording."""
+    def folder(self) -> Path: ...
 
     @property
     def scenario(self) -> Scenario:
@@ -75,8 +74,7 @@ class RecordedDrive(Protocol):
     def load(self) -> IdentifiedLoad | None:
         """Load identified before the session; None if it was estimated in the session."""
 
-    def repeat(self, progress: UpdateProgress, log: Path | None = None) -> SimulationResult:
-        """Simulate the recorded session again."""
+    def repeat(self, progress: UpdateProgress, log: Path | None = None) -> SimulationResult: ...
 
 
 def run_command(
@@ -89,7 +87,7 @@ def run_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Run a scenario, or repeat `drive`; replace the results in `out`.
+    """Run a scenario, or repeat the recorded live session `drive`; replace the results in `out`.
 
     Return summary.json and session.json in one dictionary.
     """
@@ -104,7 +102,7 @@ def run_command(
         setup = replace(setup, simulation__seed=seed)
     with files.output_folder(out):
         with show_progress(progress and not quiet) as stage:
-            run = _run_and_log_into_folder(setup, out, stage, fresh, drive)
+            run = _run_and_log_scenario_or_drive(setup, out, stage, fresh, drive)
             written = stage("Write pictures and 3D replay")
             files.write_picture(out / "overview.png", draw_overview(run.result))
             written(0.3)
@@ -122,7 +120,7 @@ def run_command(
     return summary | session
 
 
-def _run_and_log_into_folder(
+def _run_and_log_scenario_or_drive(
     setup: Scenario, out: Path, stage: StartStage, fresh: bool, drive: RecordedDrive | None
 ) -> ScenarioRun:
     log, scenario_file = out / "log.parquet", out / _SCENARIO_FILE_NAME
@@ -158,12 +156,8 @@ def run_scenario(
 ) -> ScenarioRun:
     """Run a scenario; the load is estimated during the run, or else cached or identified before.
 
-    A run that estimates the load without intent and task uses an excitation trajectory.
-
-    Args:
-        progress: True for progress bars, or a `StartStage`.
-        log: as in `simulate`.
-        fresh: True ignores the cached load.
+    Without operator motion and task, a run that estimates the load excites it by a trajectory.
+    `log` is as in `simulate`; `fresh` ignores the cached load.
     """
     check_scenario(scenario)
     estimates_load, source = scenario.load_estimator.enabled, "estimated during the run"

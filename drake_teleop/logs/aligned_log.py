@@ -16,7 +16,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import (
     Array,
     one_blas_thread,
-    samples_to_nearest_flag,
+    samples_to_nearest_true,
     width_and_centre_of_narrowest_half,
 )
 from drake_teleop.load.batch.consistent import consistent_least_squares
@@ -256,7 +256,7 @@ def _reduce_sample_rate(log: Log, cutoff_hz: float | None) -> Log:
         wrench[start : start + _CHUNK_SAMPLES] = smooth[::stride][start - before :][:_CHUNK_SAMPLES]
     bridged = None
     if log.bridged is not None:
-        bridged = samples_to_nearest_flag(log.bridged)[::stride] <= stride
+        bridged = samples_to_nearest_true(log.bridged)[::stride] <= stride
     return replace(few, wrench=wrench, bridged=bridged)
 
 

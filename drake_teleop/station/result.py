@@ -15,7 +15,7 @@ import numpy as np
 
 from drake_teleop.common import errors
 from drake_teleop.common.errors import DrakeTeleopError, expect_type
-from drake_teleop.common.files import LOG_PARTS_PATTERN, log_part_path, make_folder, write_table
+from drake_teleop.common.files import LOG_PARTS_GLOB, log_part_path, make_folder, write_table
 from drake_teleop.common.numeric import Array, float_array
 from drake_teleop.common.parquet_sizes import check_parquet_sizes
 
@@ -354,7 +354,7 @@ def _components_and_units_text(spec: Signal) -> str:
 
 
 def _files_of_log(path: Path) -> list[Path]:
-    return sorted(path.glob(LOG_PARTS_PATTERN)) or [path]
+    return sorted(path.glob(LOG_PARTS_GLOB)) or [path]
 
 
 def _read_columns(path: Path, columns: list[str]) -> Array:

@@ -154,7 +154,7 @@ def test_models_without_displayed_force_have_no_deviation(gamma, sigma):
     axis, sampling = OneAxis(gamma=gamma, sigma=sigma, wall_stiffness=0.0), Sampling()
     with_hand_mass = replace_fields(axis, device_mass=axis.device_mass + axis.hand_mass)
     H = sampled_two_port(with_hand_mass, sampling, analyze.OMEGA)
-    found = analyze.two_port_deviations(H, axis, sampling)
+    found = analyze.two_port_errors_of_axis(H, axis, sampling)
     assert max(found["sampled"].values()) == 0.0
     assert np.isfinite(list(found["closed_form"].values())).all()
 
@@ -171,12 +171,12 @@ def test_unequal_delays_are_no_deviation_from_one_axis(ahead, back, sigma):
         for delay in (axis.delay, 0.0)
     ]
     H, undelayed = (sampled_two_port(model, Sampling(), analyze.OMEGA) for model in models)
-    H[:, 0, 1] = undelayed[:, 0, 1] * np.exp(-analyze.S_AT_OMEGA * back)
-    H[:, 1, 0] = undelayed[:, 1, 0] * np.exp(-analyze.S_AT_OMEGA * ahead)
-    assert (max(analyze.two_port_deviations(H, axis, Sampling())["sampled"].values()) > 0.1) == (
-        ahead != back
-    )
-    found = analyze.two_port_deviations(analyze.with_equal_delays(H, scenario), axis, Sampling())
+    H[:, 0, 1] = undelayed[:, 0, 1] * np.exp(-analyze.J_OMEGA * back)
+    H[:, 1, 0] = undelayed[:, 1, 0] * np.exp(-analyze.J_OMEGA * ahead)
+    assert (
+        max(analyze.two_port_errors_of_axis(H, axis, Sampling())["sampled"].values()) > 0.1
+    ) == (ahead != back)
+    found = analyze.two_port_errors_of_axis(analyze.with_mean_delays(H, scenario), axis, Sampling())
     assert max(found["sampled"].values()) < 1e-9
 
 

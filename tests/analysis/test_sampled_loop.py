@@ -33,10 +33,10 @@ from drake_teleop.lab.analysis.period_map import (
     SLAVE_V,
     SLAVE_X,
     Sampling,
-    mass_spring_responses_to_unit_x_v_u,
+    mass_spring_unit_responses,
     one_way_delay_in_hand_periods,
-    period_map_of_cut_loop,
     sampled_two_port,
+    transition_matrix_of_cut_loop,
 )
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 
@@ -159,12 +159,14 @@ def test_delay_is_rounded_to_hand_periods_and_at_least_one(delay: float, steps: 
 
 
 def test_period_map_is_computed_once_for_all_delays_and_equal_gaps(monkeypatch):
-    gaps, slave_rows = [], period_map._slave_map_rows
+    gaps, slave_rows = [], period_map._slave_transition_rows
     monkeypatch.setattr(
-        period_map, "_slave_map_rows", lambda *given: gaps.append(given[2]) or slave_rows(*given)
+        period_map,
+        "_slave_transition_rows",
+        lambda *given: gaps.append(given[2]) or slave_rows(*given),
     )
     delays, sigmas = np.linspace(0.0, 0.1, 7), np.array([[0.0], [1.0]])
-    M = period_map_of_cut_loop(OneAxis(delay=delays, sigma=sigmas), STATION)
+    M = transition_matrix_of_cut_loop(OneAxis(delay=delays, sigma=sigmas), STATION)
     assert M.shape[:-2] == sigmas.shape
     assert gaps == [1 / STATION.sensor_hz]
 
@@ -183,7 +185,7 @@ def test_two_port_agrees_with_loop_without_hand_and_wall(sampling: Sampling, ste
     port[:, 0, 0] -= device
     H[:, 0, 0] -= device
     np.testing.assert_allclose(H, port * late, atol=1e-9)
-    M = period_map_of_cut_loop(bare, sampling)
+    M = transition_matrix_of_cut_loop(bare, sampling)
     n = len(M) - 3
     A = M[:n, :n].copy()
     A[:, SAMPLED_FORCE] += M[:n, RECEIVED_FORCE]
@@ -350,6 +352,6 @@ def test_held_response_on_a_stiff_wall_equals_closed_form(turns):
     """x'' = u - w^2 x: cosines and sines, for any number of oscillations in a step."""
     w, t = 300.0, turns * 2 * np.pi / 300.0 + 1e-3
     c, s = np.cos(w * t), np.sin(w * t)
-    (found,) = mass_spring_responses_to_unit_x_v_u(w**2, 0.0, np.array([t]))
+    (found,) = mass_spring_unit_responses(w**2, 0.0, np.array([t]))
     exact = [[c, s / w, (1 - c) / w**2], [-w * s, c, s / w]]
     np.testing.assert_allclose(found, exact, atol=1e-9 * w)

@@ -5,7 +5,7 @@ import phantom_arrays as arrays
 import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.lab.analysis.analyze import describe_wall_source
+from drake_teleop.lab.analysis.analyze import describe_origin_of_wall_stiffness
 from drake_teleop.lab.analysis.linearization import network_delay_periods
 from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario, task_direction
 from drake_teleop.lab.identification import slave_arm
@@ -88,7 +88,7 @@ def test_wall_stiffness_and_description_of_environments(things, stiffness, what)
     scenario = replace(Scenario(), environment=things)
     found = OneAxisFromScenario(scenario, (0, 0, 1)).wall_stiffness
     assert found == pytest.approx(stiffness)
-    assert describe_wall_source(scenario, found > 0.0) == what
+    assert describe_origin_of_wall_stiffness(scenario, found > 0.0) == what
 
 
 @pytest.mark.parametrize("direction", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, -2, 0.5)])

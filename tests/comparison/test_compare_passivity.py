@@ -137,7 +137,7 @@ def test_comparison_of_a_custom_scenario(monkeypatch, tmp_path):
     assert (base.slave.payload.mass, base.simulation.seed, base.rates) == (
         0.3,
         3,
-        study._COMPARISON_RATES,
+        study._SAMPLE_RATES,
     )
     assert base.surroundings is None and base.contact_detection is None
     # An estimator would count the contact wrench as load.
@@ -207,8 +207,13 @@ def test_preset_networks_have_the_known_delays():
 
 @pytest.mark.slow
 def test_longest_round_trip_is_below_the_first_unstable_one():
-    assert study.longest_round_trip("none", OneDof(wall_stiffness=500.0), 0.0, 0.0, [0]) == 1.0
-    assert study.longest_round_trip("none", OneDof(wall_stiffness=20000.0), 0.0, 0.0, [0]) == 0.0
+    assert (
+        study.longest_stable_round_trip("none", OneDof(wall_stiffness=500.0), 0.0, 0.0, [0]) == 1.0
+    )
+    assert (
+        study.longest_stable_round_trip("none", OneDof(wall_stiffness=20000.0), 0.0, 0.0, [0])
+        == 0.0
+    )
 
 
 def test_missing_scenario_is_an_error_before_the_work(tmp_path, monkeypatch):

@@ -11,10 +11,10 @@ from drake_teleop.lab.comparison import compare_passivity
 from drake_teleop.lab.comparison.compare_passivity import simulate_release_and_taps
 from drake_teleop.lab.comparison.one_dof import AT_SLAVE
 from drake_teleop.lab.comparison.report import (
-    decision_table,
     draw_decision_table,
     draw_energy_traces,
     draw_force_traces,
+    stability_table,
 )
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig
@@ -54,7 +54,7 @@ def summary(hands_leaked: float = 0.0, **second_leaf: object) -> dict[str, objec
     ],
 )
 def test_cell_has_the_first_verdict_that_applies(changes, words, share):
-    (cell,) = decision_table(summary(**changes)).values()
+    (cell,) = stability_table(summary(**changes)).values()
     assert (cell.verdict_text, cell.least_displayed_share_text) == (words, share)
     (axes,) = draw_decision_table(summary(**changes)).axes
     written = [text.get_text() for text in axes.texts]

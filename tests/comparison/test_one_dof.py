@@ -69,7 +69,7 @@ def grows(model: OneDof, round_trip: int, rest: float) -> bool:
     return bool(swing[1] > swing[0])
 
 
-def longest_round_trip(model: OneDof, rest: float, low: int, high: int) -> int:
+def longest_stable_round_trip(model: OneDof, rest: float, low: int, high: int) -> int:
     """Return the largest stable round trip in periods, below `high`."""
     while high - low > 1:
         middle = (low + high) // 2
@@ -96,7 +96,7 @@ def test_longest_delay_in_contact_equals_closed_form(grip, wall):
     model = held(grip, wall_stiffness=wall)
     # Interpolation and hold add a delay.
     expected = contact_limit(grip, wall) / PERIOD_S - 1.5
-    found = longest_round_trip(model, 0.02, 1, round(2 * expected) + 4)
+    found = longest_stable_round_trip(model, 0.02, 1, round(2 * expected) + 4)
     assert found == pytest.approx(expected, abs=1.0)
 
 
@@ -185,7 +185,7 @@ def test_simulation_and_linear_analysis_agree(model):
         model, hand_damping=model.hand_damping + DEVICE_DAMPING, device_friction=0.0
     )
     expected = margin / PERIOD_S - 1.5
-    found = longest_round_trip(damped, 0.02, 1, round(2 * expected) + 4)
+    found = longest_stable_round_trip(damped, 0.02, 1, round(2 * expected) + 4)
     assert found == pytest.approx(expected, abs=1.0)
 
 

@@ -342,7 +342,7 @@ def test_infeasible_design_writes_no_file(slave, tmp_path, capsys):
         ({"max_sensor_norms": np.ones(4)}, r"the best uses .* of the sensor limit \(.*--payload"),
         (
             {"acceleration": np.full(6, 1e-6)},
-            "within all limits does not excite all parameters; it uses",
+            "within all limits does not excite all parameters; limit use:",
         ),
     ],
 )

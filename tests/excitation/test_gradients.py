@@ -17,8 +17,8 @@ from drake_teleop.lab.excitation.criteria import (
     limited_gyration_radius,
 )
 from drake_teleop.lab.excitation.limits import (
+    CLEARANCE_USE_RANGE_M,
     LIMIT_NAMES,
-    ZERO_USE_CLEARANCE_MARGIN_M,
     Limits,
     capsule_distances,
     link_motion_series,
@@ -214,7 +214,7 @@ def test_largest_use_of_each_limit_matches_its_definition(arm):
         "velocity": np.abs(qd) / limits.velocity,
         "acceleration": np.abs(qdd) / limits.acceleration,
         "workspace": np.abs(points - limits.box_middle) / limits.box_half,
-        "clearance": 1.0 - (distances - limits.min_pair_distances) / ZERO_USE_CLEARANCE_MARGIN_M,
+        "clearance": 1.0 - (distances - limits.min_pair_distances) / CLEARANCE_USE_RANGE_M,
     }.items():
         assert found[name] == pytest.approx(expected.max(), rel=1e-12), name
     # A use of 1 is the minimum distance.

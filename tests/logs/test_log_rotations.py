@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.rotations import (
-    NUM_COLUMNS_OF_ROTATION_FORM,
+    NUM_COLUMNS_BY_ROTATION_FORM,
     orthogonality_error,
     rotation_matrices,
 )
@@ -48,7 +48,7 @@ def test_solve_handles_a_zero_residual() -> None:
 
 
 @pytest.mark.parametrize("inverse", [False, True])
-@pytest.mark.parametrize("form", NUM_COLUMNS_OF_ROTATION_FORM)
+@pytest.mark.parametrize("form", NUM_COLUMNS_BY_ROTATION_FORM)
 def test_orientations_of_selected_rows_in_any_form_are_read(form: str, inverse: bool) -> None:
     turns = Rotation.from_rotvec(VECTORS[:5])
     columns = {

@@ -19,7 +19,7 @@ from drake_teleop.lab.reproduction.experiments import (
 from drake_teleop.lab.reproduction.report import (
     Comparison,
     compare_with_paper,
-    describe_unaccepted,
+    describe_values_outside_ranges,
     figure_captions,
     parameter_rows,
     write_report,
@@ -67,10 +67,10 @@ def test_only_found_and_reported_values_agree():
     assert set(verdicts.values()) == {"agrees", "as set", "within our bound", "for the record"}
     assert [row.quantity for row in rows if row.verdict == "agrees"] == [
         "Fig. 6: largest residual force, σ = 0",
-        "Fig. 8: detection delay in the contact force",
-        "Fig. 8: a threshold on the raw force detects contact",
-        "Fig. 8: false alarm at about 600 ms",
-        "Fig. 8: contact peak over inertial peak",
+        "Fig. 8: delay from contact to detection",
+        "Fig. 8: raw force exceeds its free range",
+        "Fig. 8: contact force false alarm, 600 ms",
+        "Fig. 8: contact / inertial peak force",
     ]
     assert {row.set_or_found for row in rows if row.verdict == "agrees"} == {"found"}
     assert {row.set_or_found for row in rows if row.verdict == "as set"} == {"set"}
@@ -91,7 +91,7 @@ def test_unreported_values_never_agree():
     [
         ("free_force.peak_raw_N", 130.0, "peak force at the slave", "not as set"),
         ("free_force.peak_raw_N", float("nan"), "peak force at the slave", "not as set"),
-        ("free_force.half_ratio", 0.6, "σ = 0.5 over σ = 1", "not as set"),
+        ("free_force.half_ratio", 0.6, "σ = 0.5 / σ = 1", "not as set"),
         ("free_force.residual_max_N", 5.1, "largest residual force", "differs"),
         (
             "ideal.residual_max_N",
@@ -105,11 +105,11 @@ def test_unreported_values_never_agree():
             "All axes, ideal sensor, true φ: residual t",
             "beyond our bound",
         ),
-        ("contact.detected_s", 0.2404, "detection delay in the contact force", "differs"),
-        ("contact.detected_s", 0.2154, "detection delay in the contact force", "differs"),
-        ("contact.raw_detectable", True, "threshold on the raw force", "differs"),
+        ("contact.detected_s", 0.2404, "delay from contact to detection", "differs"),
+        ("contact.detected_s", 0.2154, "delay from contact to detection", "differs"),
+        ("contact.raw_detectable", True, "raw force exceeds", "differs"),
         ("contact.false_alarm_0_6_s", True, "false alarm", "differs"),
-        ("contact.peak_contact_N", 90.0, "over inertial peak", "differs"),
+        ("contact.peak_contact_N", 90.0, "contact / inertial peak", "differs"),
         ("identification.mass_error_percent", 0.3, "Mass", "beyond our bound"),
     ],
 )
@@ -124,7 +124,7 @@ def test_each_wrong_value_changes_only_its_own_verdict(name, value, what, verdic
     for full, number in wrong.items():
         part, _, short = full.partition(".")
         nested.setdefault(part, {})[short] = number
-    (line,) = describe_unaccepted(nested)
+    (line,) = describe_values_outside_ranges(nested)
     assert line.startswith(row.quantity) and line.endswith(verdict)
 
 

@@ -17,7 +17,7 @@ from drake_teleop.cli.main import main
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.reproduction import experiments, reproduce
 from drake_teleop.lab.reproduction.experiments import (
-    SIGMAS,
+    DISPLAYED_LOAD_SHARES,
     MotionRun,
     RunsWithAndWithoutContact,
     detection_and_peaks_of_contact_run,
@@ -29,7 +29,7 @@ from drake_teleop.lab.reproduction.experiments import (
 )
 from drake_teleop.lab.reproduction.report import (
     compare_with_paper,
-    describe_unaccepted,
+    describe_values_outside_ranges,
     values_by_full_name,
 )
 from drake_teleop.load.compensation import contact_wrench
@@ -139,7 +139,7 @@ def test_the_speed_was_measured(run):
 
 @pytest.mark.slow
 def test_all_rows_are_accepted(run):
-    assert describe_unaccepted(run[0]) == []
+    assert describe_values_outside_ranges(run[0]) == []
 
 
 @pytest.mark.slow
@@ -379,7 +379,7 @@ def test_wrong_mass_increases_the_residual():
     estimate = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
     estimate[6:] *= 1.1
     motion = simulate_motion(scenario, estimate, lambda done: None)
-    assert tuple(motion.scaled_wrenches) == SIGMAS
+    assert tuple(motion.scaled_wrenches) == DISPLAYED_LOAD_SHARES
     figures = peaks_and_residuals_of_free_run(motion, 2, "N")
     assert figures["residual_max_N"] == pytest.approx(0.1 * figures["peak_raw_N"], rel=0.05)
     assert figures["half_ratio"] == pytest.approx(0.45, abs=0.01)

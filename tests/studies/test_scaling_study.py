@@ -12,10 +12,10 @@ from shown import type_in
 from drake_teleop.common.files import studies_dir
 from drake_teleop.lab.studies import scaling_study
 from drake_teleop.lab.studies.scaling_study import (
-    CRITERIA_SETS,
+    CRITERIA_BY_CHOICE,
     TASK_CRITERIA,
     draw_best_scales,
-    rate_scales,
+    judge_scales,
 )
 from drake_teleop.lab.studies.study import LoadStudy
 from drake_teleop.station.scenario import ScenarioNames
@@ -45,22 +45,22 @@ def tables(seeds: int = 20, spread: float = 0.05) -> dict[str, dict[str, np.ndar
 def test_best_point_of_each_selection():
     # Indices of (sigma, gamma).
     for criteria, best in ((("effort",), (0, 0)), (("time",), (0, 3)), (("force",), None)):
-        found = rate_scales(tables(), criteria)
+        found = judge_scales(tables(), criteria)
         place = np.unravel_index(np.nanargmin(found.merit), found.merit.shape)
         assert place[1] == 5 if best is None else place == best
         assert np.all((found.merit_low <= found.merit) & (found.merit <= found.merit_high))
         assert found.merit[4, 2] == pytest.approx(1.0)  # the reference against itself
         assert found.best_share.sum() == pytest.approx(1.0)
-    assert rate_scales(tables(), ("effort",)).best_share[0, 0] > 0.95
+    assert judge_scales(tables(), ("effort",)).best_share[0, 0] > 0.95
     # Without dependence on sigma the choice must be uncertain.
-    assert rate_scales(tables(), ("force",)).best_share.max() < 0.95
+    assert judge_scales(tables(), ("force",)).best_share.max() < 0.95
 
 
 def test_points_with_many_failures_are_excluded():
     failing = tables()
     failing["press"]["success"][0, 0, :2] = 0.0  # one in ten
     failing["press"]["effort"][0, 0, :2] = np.nan
-    found = rate_scales(failing, ("effort",))
+    found = judge_scales(failing, ("effort",))
     assert np.isnan(found.merit[0, 0])
     assert found.best_share[0, 0] == 0.0
 
@@ -70,7 +70,7 @@ def test_one_failure_in_twenty_is_accepted(failing, seeds):
     rows = tables(seeds)
     rows["press"]["success"][0, 0, :failing] = 0.0
     rows["press"]["effort"][0, 0, :failing] = np.nan
-    assert np.isfinite(rate_scales(rows, ("effort",)).merit[0, 0]) == (20 * failing <= seeds)
+    assert np.isfinite(judge_scales(rows, ("effort",)).merit[0, 0]) == (20 * failing <= seeds)
 
 
 @pytest.mark.parametrize(("failing", "best"), [(2, 1.0), (3, 0.0)])
@@ -78,7 +78,7 @@ def test_seeds_with_failed_reference_are_excluded(failing, best):
     rows = tables(seeds=3)
     rows["press"]["success"][4, 2, :failing] = 0.0
     rows["press"]["effort"][4, 2, :failing] = np.nan
-    found = rate_scales(rows, ("effort",))
+    found = judge_scales(rows, ("effort",))
     assert np.isfinite(found.merit_low).sum() == np.isfinite(found.merit).sum() == 29 * best
     assert found.best_share.sum() == pytest.approx(best)
 
@@ -86,11 +86,11 @@ def test_seeds_with_failed_reference_are_excluded(failing, best):
 def test_choice_picture_has_one_scale_and_no_empty_cell():
     failing = tables()
     failing["press"]["success"][:2, 0, :3] = 0.0  # three of twenty
-    answers = {way: rate_scales(failing, criteria) for way, criteria in CRITERIA_SETS.items()}
+    answers = {way: judge_scales(failing, criteria) for way, criteria in CRITERIA_BY_CHOICE.items()}
     sigmas, gammas = [0, 0.1, 0.25, 0.5, 1], [0.25, 0.5, 1, 2, 4, 8]
     figure = draw_best_scales(answers, sigmas, gammas)
     images = [image for axes in figure.axes for image in axes.images]
-    assert len(images) == len(CRITERIA_SETS)
+    assert len(images) == len(CRITERIA_BY_CHOICE)
     assert len({image.norm for image in images}) == 1
     for axes, found in zip(figure.axes, answers.values(), strict=False):
         words = {text.get_position(): text.get_text() for text in axes.texts}
@@ -102,7 +102,7 @@ def test_choice_picture_has_one_scale_and_no_empty_cell():
 
 def test_more_seeds_give_narrower_intervals():
     widths = [np.mean(found.merit_high - found.merit_low) for found in (
-        rate_scales(tables(seeds, 0.3), ("effort", "time", "force")) for seeds in (10, 160)
+        judge_scales(tables(seeds, 0.3), ("effort", "time", "force")) for seeds in (10, 160)
     )]  # fmt: skip
     assert widths[1] < 0.5 * widths[0]
 

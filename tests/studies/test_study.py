@@ -26,7 +26,7 @@ from drake_teleop.lab.studies import study as studies
 from drake_teleop.lab.studies.adaptive import propose_points
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.measures import default_measures, evaluate_measures
-from drake_teleop.lab.studies.runs import ONE_TIME_COST_KEY, StudyProgress, run_study
+from drake_teleop.lab.studies.runs import SETUP_TIME_S_KEY, StudyProgress, run_study
 from drake_teleop.lab.studies.store import Store, open_store
 from drake_teleop.lab.studies.study import LoadStudy, study_command
 from drake_teleop.station.result import SimulationResult
@@ -666,7 +666,7 @@ def test_fields_of_the_scenarios_own_task_can_be_factors(
             ("values: [0, 0.5, 1]", "low: -1e308, high: 1e308"),
             "factors[0]: the value or range inf",
         ),
-        (("[0, 0.5, 1]", "[1, 1]"), "factors[0]: repeats the value 1.0"),
+        (("[0, 0.5, 1]", "[1, 1]"), "factors[0]: lists 1.0 twice"),
         (("operator.grip, words: [light, firm]", "force_scaling.sigma, values: [1]"), "twice"),
         (
             ("force_scaling.sigma", "simulation.seed"),
@@ -733,7 +733,7 @@ def test_many_runs_require_consent(files, tmp_path, monkeypatch):
     path.write_text(MANY.replace("LEVELS", "501"))
     with pytest.raises(
         DrakeTeleopError,
-        match=r"many\.yaml: 100,200 runs require a confirmation; confirm them by --yes",
+        match=r"many\.yaml: 100,200 runs need your consent; confirm them by --yes",
     ):
         study_command(path, out)
     with pytest.raises(DrakeTeleopError, match="--yes"):
@@ -810,7 +810,7 @@ def test_remaining_time_follows_from_the_latest_runs():
     counter.start_reporting(lambda fraction, words="": shown.append((fraction, words)), 4)
     counter.add_earlier_runs(20)
     assert shown == [(0.2, "20/100, the first runs begin")]
-    counter.add_finished_runs([{"seconds": 9.0, ONE_TIME_COST_KEY: 7.0}] * 2)
+    counter.add_finished_runs([{"seconds": 9.0, SETUP_TIME_S_KEY: 7.0}] * 2)
     assert shown[-1] == (0.22, "22/100, about 0:00:39 left")
     for _ in range(18):
         counter.add_finished_runs([{"seconds": 2.0}])
@@ -825,7 +825,7 @@ def test_repeated_identifications_count_in_the_remaining_time():
     counter = StudyProgress(100)
     counter.start_reporting(lambda fraction, words="": shown.append(words), 1)
     for _ in range(40):
-        counter.add_finished_runs([{"seconds": 9.0, ONE_TIME_COST_KEY: 7.0}])
+        counter.add_finished_runs([{"seconds": 9.0, SETUP_TIME_S_KEY: 7.0}])
     assert shown[0] == "1/100, about 0:03:18 left"
     assert shown[-1] == "40/100, about 0:09:00 left"
 

@@ -29,7 +29,7 @@ from drake_teleop.lab.tuning.press_trial import (
     make_operating_range,
     renderable_press_depth,
     rms_above_5_hz,
-    without_task_and_method,
+    without_task_and_passivity_method,
 )
 from drake_teleop.lab.tuning.tune import meets_requirements, search_settings, tune
 from drake_teleop.station.channel.channel import Channel
@@ -99,7 +99,7 @@ def test_ideal_network_is_refused_for_each_passivity(passivity):
     """Runs with the candidate method "none" would have no energy balance."""
     scenario = replace(LoadScenario("contact_transition"), passivity=passivity)
     with pytest.raises(DrakeTeleopError, match=r"^network: the scenario has no network"):
-        without_task_and_method(scenario, "ideal")
+        without_task_and_passivity_method(scenario, "ideal")
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_ideal_network_is_refused_for_each_passivity(passivity):
 def test_scale_of_0_is_refused(block, name):
     scenario = replace(LoadScenario("contact_transition"), **{f"{block}__{name}": 0.0})
     with pytest.raises(DrakeTeleopError, match=rf"^{block}\.{name}: is 0"):
-        without_task_and_method(scenario, "internet")
+        without_task_and_passivity_method(scenario, "internet")
 
 
 def test_no_run_updates_the_load(tmp_path, monkeypatch):
@@ -133,7 +133,7 @@ def test_no_run_updates_the_load(tmp_path, monkeypatch):
 
 def test_unknown_networks_are_refused():
     with pytest.raises(DrakeTeleopError, match=r"^network: 'internt' is unknown"):
-        without_task_and_method(LoadScenario("touch"), "internt")
+        without_task_and_passivity_method(LoadScenario("touch"), "internt")
 
 
 def test_leaf_of_a_stiffness_has_this_stiffness():
@@ -286,7 +286,7 @@ class FakeStation:
 
 def trial(walls=(0.5, 20.0), task: str = "press") -> StationPressTrial:
     given = LoadScenario("contact_transition")
-    base = without_task_and_method(given, "internet")
+    base = without_task_and_passivity_method(given, "internet")
     return StationPressTrial(
         given, base, make_operating_range(["light", "firm"], walls, task), np.ones(16)
     )
@@ -456,7 +456,7 @@ def test_search_refuses_a_set_that_no_settings_hold():
 
 
 def test_settings_change_method_scales_and_filter_alone():
-    base = without_task_and_method(LoadScenario("contact_transition"), "internet")
+    base = without_task_and_passivity_method(LoadScenario("contact_transition"), "internet")
     stated = make_operating_range(["light", "firm"], [1.0], "press")
     tuned = TunedSettings("charged_tdpa", 2.0, 0.3, 100.0).apply(base, stated)
     assert tuned.force_scaling.scales().load_scales == (0.3, 0.3, 0.0, 0.0)

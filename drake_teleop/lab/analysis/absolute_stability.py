@@ -1,4 +1,4 @@
-"""Stability criteria of a station for any passive hand and environment, or impedance ranges.
+"""Stability criteria of a station for passive, or bounded, impedances of hand and environment.
 
 H is the station's hybrid matrix (..., 2, 2) of `two_port` at frequencies omega [rad/s].
 """
@@ -38,7 +38,7 @@ def llewellyn_parameter(H: Complex) -> Array:
 
 
 def is_absolutely_stable(H: Complex) -> BooleanArray:
-    """Return whether the station is stable with every passive load, for each frequency of H."""
+    """Return whether H is stable with any passive hand and environment, at each frequency."""
     h11, h12, h21, h22 = matrix_entries(H)
     return _is_criterion_met(H, llewellyn_criterion(H), np.abs(h12 * h21) + np.abs(h11 * h22))
 
@@ -90,7 +90,7 @@ def structured_singular_value(
 ) -> Array:
     """Return the structured singular value mu of the scattering matrix S (T56).
 
-    The loads' wave reflection factors are at most the given ones. With 1 (any passive load),
+    Hand and environment have at most these wave reflection factors. With 1 (passive),
     mu <= 1 means absolutely stable.
     """
     s11, s12, s21, s22 = matrix_entries(S)
@@ -157,8 +157,8 @@ def impedance_range_of_grips() -> ImpedanceRange:
 def stiffness_limit(H: Complex, omega: Array, hand: ImpedanceRange) -> Array:
     """Return, for each omega, the softest wall [N/m] that oscillates with a hand in range (T57).
 
-    0: oscillates in free motion; inf: with no wall. If all values of a dense grid of omega are inf,
-    all hands in range are stable, or all are unstable. A range of one hand always gives inf.
+    0: free motion oscillates; inf: no wall stiffness does. If a dense grid of omega gives inf only,
+    stability is the same for all hands in range. A range of one hand always gives inf.
     """
     h11, h12, h21, h22 = (entry[..., None] for entry in matrix_entries(H))
     z = hand.corners(omega)
@@ -180,9 +180,9 @@ def stiffness_limit(H: Complex, omega: Array, hand: ImpedanceRange) -> Array:
 def singular_value_in_ranges(
     H: Complex, omega: Array, hand: ImpedanceRange, environment: ImpedanceRange
 ) -> Array:
-    """Return the structured singular value mu at `omega` [rad/s] for ranges of both loads.
+    """Return the structured singular value mu for ranges of hand and environment.
 
-    Below 1: no hand and environment in these ranges oscillate at `omega`.
+    Below 1: no hand and environment in these ranges oscillate at this `omega` [rad/s].
     """
     z, r1 = (values[..., :, None] for values in _discs_around_rectangle(hand.corners(omega)))
     e, r2 = (values[..., None, :] for values in _discs_around_rectangle(environment.corners(omega)))

@@ -15,7 +15,7 @@ from drake_teleop.common.progress import StartStage, show_progress
 from drake_teleop.lab.analysis import absolute_stability, cut_loop, linearization, report, two_port
 from drake_teleop.lab.analysis.frequency_response import MultiSine, measure_frequency_response
 from drake_teleop.lab.analysis.linear_model import COMPONENT_NAMES, MAX_STATES, Linearization
-from drake_teleop.lab.analysis.linearization import close_network, linearize, two_port_along
+from drake_teleop.lab.analysis.linearization import close_network_loop, linearize, two_port_along
 from drake_teleop.lab.analysis.maps import RATE_NAME, StabilityMap, stability_map
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis, environment_impedance
 from drake_teleop.lab.analysis.period_map import Sampling, closed_axis_model, sampled_two_port
@@ -27,13 +27,13 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.slave.plant import NominalSlave
 
-UNIT_VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+UNIT_VECTOR_W_BY_AXIS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 #: N/m, walls of the table of margins, in addition to the scenario's own.
 MARGIN_WALL_STIFFNESSES_N_M = (0.0, 1000.0, 5100.0, 20000.0)
 MAX_COMPARED_OMEGA_RAD_S = 2 * np.pi * 30.0  #: rad/s, limit of the comparison of models
 #: Frequencies of the analysis [rad/s].
 OMEGA: Array = 2 * np.pi * np.geomspace(0.1, 300.0, 500)
-S_AT_OMEGA: Complex = 1j * OMEGA.astype(complex)
+J_OMEGA: Complex = 1j * OMEGA.astype(complex)
 _MAX_IMPEDANCE_FIT_OMEGA_RAD_S = 2 * np.pi * 5.0  # limit of the fit of mass, damping and stiffness
 _NUM_POINTS_PER_MAP_AXIS = 80  # points of a map in each direction
 _PROBING_MULTI_SINE = MultiSine(lowest=0.6, period=1.5, settle=1.0)
@@ -78,7 +78,7 @@ def _analyze_in_stages(
     method = scenario.passivity.method
     linear = replace(scenario, passivity=PassivityConfig())
     estimate = true_load(scenario)
-    along = task_direction(linear, UNIT_VECTORS[direction])
+    along = task_direction(linear, UNIT_VECTOR_W_BY_AXIS[direction])
     sampling = sampling_of_scenario(linear)
     contact, is_wall_known = along.axis, along.axis.wall_stiffness > 0.0
     if not is_wall_known:
@@ -91,15 +91,15 @@ def _analyze_in_stages(
     points = [("free motion", free, axis)]
     if scenario.first_sheet_spring is not None:
         alone = replace(linear.without_environment(), sheet_spring=scenario.first_sheet_spring)
-        depth = master_displacement_into_leaf(alone)
+        depth = master_displacement_into_sheet_spring(alone)
         pressed = linearize(alone, load_estimate=estimate, displacement=depth)
         points.append(("on the leaf", pressed, contact))
     progress(1.0)
 
     progress = stage("Two-port, margins, transparency")
-    one_loop_open = close_other_directions(free, linear, along)
+    one_loop_open = close_feedback_of_other_directions(free, linear, along)
     with_hand = two_port_along(one_loop_open, OMEGA, along.hand, along.tool)
-    H = two_port.absorb_impedances(with_hand, hand=-S_AT_OMEGA * axis.hand_mass)
+    H = two_port.absorb_impedances(with_hand, hand=-J_OMEGA * axis.hand_mass)
     progress(0.3)
     summary: dict[str, Any] = {
         "direction": direction,
@@ -107,13 +107,13 @@ def _analyze_in_stages(
         "method": method,
         "delay_s": axis.delay,
         "wall_N_per_m": contact.wall_stiffness,
-        "wall_is": describe_wall_source(scenario, is_wall_known),
+        "wall_is": describe_origin_of_wall_stiffness(scenario, is_wall_known),
         "axis": dataclasses.asdict(axis) | {"tool_coupling": along.tool_coupling},
         "diagram": [
             summarise_diagram_stability(name, close_all_loops(system, linear), one_axis, sampling)
             for name, system, one_axis in points
         ],
-        "two_port": two_port_deviations(with_equal_delays(with_hand, linear), axis, sampling),
+        "two_port": two_port_errors_of_axis(with_mean_delays(with_hand, linear), axis, sampling),
         "margins": margin_rows(axis, sampling, contact.wall_stiffness),
         "absolute": absolute_stability_values(H, axis),
         "bounded": stiffest_stable_walls(H, axis, sampling),
@@ -146,7 +146,7 @@ def _analyze_in_stages(
     return summary, report.ReportCurves(contact, OMEGA, H, nyquist, maps)
 
 
-def describe_wall_source(scenario: Scenario, is_wall_known: bool) -> str:
+def describe_origin_of_wall_stiffness(scenario: Scenario, is_wall_known: bool) -> str:
     if scenario.first_sheet_spring is not None:
         return "the leaf"
     if is_wall_known:
@@ -162,8 +162,8 @@ def sampling_of_scenario(scenario: Scenario) -> Sampling:
     return Sampling(rates.hand_hz, rates.joint_control_hz, rates.sensor_hz, low_pass_hz)
 
 
-def master_displacement_into_leaf(scenario: Scenario) -> list[float]:
-    """Return the master's displacement [m], in its base B, to a tip 5 mm inside the leaf."""
+def master_displacement_into_sheet_spring(scenario: Scenario) -> list[float]:
+    """Return the master's displacement [m], in its base B, to a tip 5 mm in the sheet spring."""
     assert scenario.first_sheet_spring is not None
     scaling = scenario.kinematic_scaling
     goal = np.array(scenario.first_sheet_spring.position) - [0.0, 0.0, 5e-3]
@@ -172,17 +172,17 @@ def master_displacement_into_leaf(scenario: Scenario) -> list[float]:
 
 
 def close_all_loops(system: Linearization, scenario: Scenario) -> Linearization:
-    return close_network(system, scenario).close_loop("operator_wrench", "hand_wrench")
+    return close_network_loop(system, scenario).close_loop("operator_wrench", "hand_wrench")
 
 
-def close_other_directions(
+def close_feedback_of_other_directions(
     system: Linearization, scenario: Scenario, along: TaskDirection
 ) -> Linearization:
-    """Return the model with all loops closed, except the hand's loop in the task direction.
+    """Return the linear model with loops closed, except the hand's in the task direction `along`.
 
-    If that direction is parallel to no axis of the master's base B, the hand's loop remains open.
+    If `along` is parallel to no axis of the master's base B, the hand's loop remains open.
     """
-    system = close_network(system, scenario)
+    system = close_network_loop(system, scenario)
     (aligned,) = np.nonzero(np.abs(along.hand) > 1 - 1e-9)
     others = [axis for k, axis in enumerate(COMPONENT_NAMES) if len(aligned) and k != aligned[0]]
     return system.close_loop(
@@ -200,7 +200,7 @@ def axis_with_grip(axis: OneAxis, grip: str) -> OneAxis:
 def summarise_diagram_stability(
     point: str, system: Linearization, axis: OneAxis, sampling: Sampling
 ) -> dict[str, Any]:
-    """Return stability and slowest mode (largest multiplier) of the Diagram and of one axis."""
+    """Return stability and slowest mode of the Diagram and of the one-axis model at a point."""
     loop = cut_loop.cut_loop(axis, sampling)
     stable = bool(cut_loop.count_unstable_multipliers(loop, axis.delay) == 0)
     return {
@@ -224,18 +224,18 @@ def _slowest_mode(system: Linearization, stable: bool) -> dict[str, Any]:
     }
 
 
-def with_equal_delays(H: Complex, scenario: Scenario) -> Complex:
+def with_mean_delays(H: Complex, scenario: Scenario) -> Complex:
     """Return H with the mean delay in both directions, as in one axis; h12 h21 is unchanged."""
     ahead, back = linearization.network_delay_periods(scenario)
-    shift = np.exp(S_AT_OMEGA * (ahead - back) / (2 * scenario.rates.hand_hz))
+    shift = np.exp(J_OMEGA * (ahead - back) / (2 * scenario.rates.hand_hz))
     h11, h12, h21, h22 = two_port.matrix_entries(H)
     return two_port.two_port_matrix(h11, h12 / shift, h21 * shift, h22)
 
 
-def two_port_deviations(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Return the largest deviation of each entry of H from both one-axis models up to 30 Hz.
+def two_port_errors_of_axis(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
+    """Return, up to 30 Hz, the largest errors of the continuous and sampled one-axis models.
 
-    The deviations are relative to the entry's largest magnitude. H includes the hand's mass.
+    They are relative to the largest magnitude of each entry of H, which includes the hand's mass.
     """
     compared = OMEGA <= MAX_COMPARED_OMEGA_RAD_S
     with_hand_mass = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)
@@ -245,14 +245,14 @@ def two_port_deviations(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[s
         found = np.abs(H[compared] - other).max(axis=0) / np.where(largest > 0, largest, 1.0)
         return {f"h{i + 1}{j + 1}": float(found[i, j]) for i in range(2) for j in range(2)}
 
-    closed_form = two_port.hybrid_matrix(with_hand_mass, S_AT_OMEGA[compared])
+    closed_form = two_port.hybrid_matrix(with_hand_mass, J_OMEGA[compared])
     sampled = sampled_two_port(with_hand_mass, sampling, OMEGA[compared])
     models = {"closed_form": closed_form, "sampled": sampled}
     return {name: max_relative_deviations_from(model) for name, model in models.items()}
 
 
 def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict[str, Any]]:
-    """Return stability margins for each grip and standard wall, and for `own_wall` [N/m]."""
+    """Return stability margins by grip and wall: standard ones and the scenario's [N/m]."""
     rows = []
     omega = np.geomspace(1e-2, np.pi * sampling.hand_hz, 6000)
     walls = sorted({*MARGIN_WALL_STIFFNESSES_N_M, own_wall})
@@ -314,9 +314,9 @@ def transparency_values(H: Complex, axis: OneAxis, contact: OneAxis) -> dict[str
     fitted = OMEGA <= _MAX_IMPEDANCE_FIT_OMEGA_RAD_S
     figures: dict[str, Any] = {}
     for name, one in (("free", axis), ("wall", contact)):
-        environment = environment_impedance(one, S_AT_OMEGA)
+        environment = environment_impedance(one, J_OMEGA)
         displayed = two_port.transmitted_impedance(H, environment)
-        ideal = two_port.ideal_impedance(axis, S_AT_OMEGA, environment)
+        ideal = two_port.ideal_impedance(axis, J_OMEGA, environment)
         noticed = two_port.is_difference_noticed(displayed, ideal)
         first = int(np.argmax(noticed)) if noticed.any() else len(noticed)
         figures[name] = {
@@ -361,7 +361,7 @@ def measure_free_impedance(
 ) -> dict[str, Any]:
     """Return the displayed impedance in free motion, simulated without Coulomb friction.
 
-    The returned errors are relative to the linear model `system`.
+    Return also its relative differences from the linear model `system`.
     """
     frictionless = scenario.master.without_coulomb_friction_and_encoder_steps()
     smooth = replace(scenario.without_environment(), master=frictionless, slave__friction=[])

@@ -42,7 +42,7 @@ class CutLoop:
     def from_multipliers(
         cls, open_multipliers: Complex, closed_multipliers: Complex, period_s: ArrayLike
     ) -> CutLoop:
-        """Return the loop with these multipliers (..., n); find the crossings of |L| = 1."""
+        """Return the loop of models with these eigenvalues (..., n), and its gain crossings."""
         shape, n = open_multipliers.shape[:-1], open_multipliers.shape[-1]
         found = np.zeros((3, *shape, _MAX_GAIN_CROSSINGS))
         _find_gain_crossings_into(
@@ -55,7 +55,7 @@ class CutLoop:
 
 
 def cut_loop(axis: OneAxis, sampling: period_map.Sampling) -> CutLoop:
-    M = period_map.period_map_of_cut_loop(axis, sampling)
+    M = period_map.transition_matrix_of_cut_loop(axis, sampling)
     n = M.shape[-1] - 3
     closed = M[..., :n, :n].copy()
     closed[..., :, period_map.SAMPLED_FORCE] += M[..., :n, n + 3 + period_map.RECEIVED_FORCE]
@@ -65,7 +65,7 @@ def cut_loop(axis: OneAxis, sampling: period_map.Sampling) -> CutLoop:
 
 
 def loop_response(loop: CutLoop, omega: ArrayLike, one_way_delay_s: ArrayLike = 0.0) -> Complex:
-    """Return the loop response L (N, ...) at `omega` (N,) [rad/s]; L = 1 is the stability limit."""
+    """Return response L (N, ...) at `omega` (N,) [rad/s]; positive feedback: L = 1 is the limit."""
     dimensions = max(loop.period_s.ndim, np.ndim(one_way_delay_s))
     w = np.atleast_1d(np.asarray(omega, dtype=float)).reshape(-1, *[1] * dimensions)
     z = np.exp(1j * w * loop.period_s)[..., None]
@@ -82,16 +82,16 @@ def gain_and_phase_margin(response: Complex) -> tuple[float, float]:
     if np.abs(response).max() < 1e-9:  # no loop
         return np.inf, np.inf
     log_gain, angle = np.log(np.abs(response)), np.angle(response)
-    crossings = _zero_crossing_fractions(log_gain)
+    crossings = _zero_crossing_fractions_of_intervals(log_gain)
     lag = np.mod(_interpolate_in_intervals(np.unwrap(angle), crossings), 2 * np.pi)
     phase = np.fmin.reduce(np.minimum(lag, 2 * np.pi - lag), initial=np.inf)
     is_jump = np.abs(np.diff(angle)) >= np.pi
-    fraction = np.where(is_jump, np.nan, _zero_crossing_fractions(angle))
+    fraction = np.where(is_jump, np.nan, _zero_crossing_fractions_of_intervals(angle))
     factor = np.exp(-_interpolate_in_intervals(log_gain, fraction))
     return float(np.min(factor[factor > 1], initial=np.inf)), float(phase)
 
 
-def _zero_crossing_fractions(value: Array) -> Array:
+def _zero_crossing_fractions_of_intervals(value: Array) -> Array:
     before, after = value[:-1], value[1:]
     step = np.where(before == after, 1.0, before - after)
     return np.where((before < 0) != (after < 0), before / step, np.nan)
@@ -113,7 +113,7 @@ def count_unstable_multipliers(loop: CutLoop, one_way_delay_s: ArrayLike) -> NDA
 
 
 def delay_margin(loop: CutLoop, round_trip_s: float = 0.0) -> Array:
-    """Return the shortest delay [s] above `round_trip_s` that makes the loop unstable, or inf."""
+    """Return the shortest unstable round-trip delay [s] above `round_trip_s`, or inf."""
     angles = loop.gain_crossing_angles
     phases = loop.gain_crossing_phases - round_trip_s / loop.period_s[..., None] * angles
     inside = (angles > 0) & (angles < np.pi) & (loop.gain_crossing_signs != 0)
@@ -148,7 +148,7 @@ def _find_gain_crossings_into(open_multipliers, closed_multipliers, angles, foun
         for i in range(at.shape[0]):
             angle, value = at[i], values[i]
             last_size, last_phase = size, phase
-            size, phase = abs(value), _phase_near(value, last_phase)
+            size, phase = abs(value), _unwrap_phase(value, last_phase)
             if (size > 1.0) != (last_size > 1.0) and count < found.shape[2]:
                 low, high = before, angle
                 while high - low > 1e-12 * high:
@@ -158,7 +158,7 @@ def _find_gain_crossings_into(open_multipliers, closed_multipliers, angles, foun
                     else:
                         high = middle
                 found[0, n, count] = low
-                found[1, n, count] = _phase_near(_response_at(zeros, poles, low, 1.0), last_phase)
+                found[1, n, count] = _unwrap_phase(_response_at(zeros, poles, low, 1.0), last_phase)
                 found[2, n, count] = 1.0 if size < last_size else -1.0
                 count += 1
             before = angle
@@ -207,6 +207,6 @@ def _add_angles_of_gain_extremes(angles, poles, zeros):
 
 
 @njit(cache=True)
-def _phase_near(response, reference):
+def _unwrap_phase(response, reference):
     phase = math.atan2(response.imag, response.real)
     return phase + 2.0 * math.pi * np.rint((reference - phase) / (2.0 * math.pi))

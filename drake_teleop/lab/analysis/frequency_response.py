@@ -96,7 +96,7 @@ class StationResponse:
         return cross / power
 
     def apparent_mass(self) -> float:
-        """Return the displayed tool mass [kg] at force scale 1; delays must be far below 0.1 s."""
+        """Return displayed tool mass over force scale [kg]; delays must be far below 0.1 s."""
         low = self.omega <= 2 * np.pi * 10.0
         if (count := np.count_nonzero(low)) < 3:
             what = f"{count} frequencies are below 10 Hz (the fit of a mass needs 3)"

@@ -66,7 +66,7 @@ class Linearization:
     def multipliers(self) -> Complex:
         """Eigenvalues over one period, by falling magnitude; stable if all magnitudes are below 1.
 
-        With more than 800 states only those near the unit circle, up to 100 Hz.
+        With more than 800 states only those near the unit circle with angles below 100 Hz.
         """
         A, size = self._state_matrix_with_delays(), self.num_states
         if size <= _MAX_STATES_FOR_DENSE_EIGENVALUES:

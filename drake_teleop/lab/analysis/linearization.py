@@ -1,6 +1,6 @@
 """The station's Diagram, linearised at rest by simulations of one period with displaced states.
 
-The loops are cut at (T63)
+Frames: stylus E, master's base B, world W, sensor S with origin So. The loops are cut at (T63)
 
     loop                       output              input
     hand on the stylus         operator_wrench     hand_wrench      F_E_B at E, in B
@@ -50,9 +50,9 @@ _OUTPUT_PORTS = ("operator_wrench", "pose_command", "wrench_B", "twist_master", 
 
 # Difference steps: truncation error grows with their square, rounding error with their inverse.
 _ANGLE_STEP, _RATE_STEP, _LINEAR_STATE_STEP = 1e-4, 1e-4, 1.0
-_WRENCH_DIFFERENCE_STEPS = np.repeat([1.0, 0.02], 3)  # N, N m: within the device's range
+_WRENCH_STEPS_N_NM = np.repeat([1.0, 0.02], 3)  # N, N m: within the device's range
 _MAX_ACCELERATION_OF_COMMAND_STEP_RAD_S2 = 20.0  # of a joint: within the motors' torque
-_MAX_JOINT_DIFFERENCE_STEP_IN_CONTACT = 1e-6  # rad, m: much less than the indentation by 1 N
+_MAX_JOINT_DIFFERENCE_STEP_IN_CONTACT_RAD = 1e-6  # rad, m: much less than the indentation by 1 N
 _MAX_RELATIVE_STATE_CHANGE_AT_REST = 1e-6  # change in one period over difference step
 _MAX_EQUILIBRIUM_NEWTON_STEPS = 8
 _TIME_TO_OPERATING_POINT_S, _TIME_AT_OPERATING_POINT_S = 0.3, 0.1  # motion, then rest
@@ -99,10 +99,10 @@ def linearize_station(
         remedy = "set method: none, or use measure_frequency_response"
         raise DrakeTeleopError(what, where="passivity.method", remedy=remedy)
     cut = linearize(scenario, load_estimate=load_estimate, displacement=displacement)
-    return close_network(cut.close_loop("operator_wrench", "hand_wrench"), scenario)
+    return close_network_loop(cut.close_loop("operator_wrench", "hand_wrench"), scenario)
 
 
-def close_network(system: Linearization, scenario: Scenario) -> Linearization:
+def close_network_loop(system: Linearization, scenario: Scenario) -> Linearization:
     forward, backward = network_delay_periods(scenario)
     system = system.close_loop("pose_command", "pose_received", forward)
     return system.close_loop("wrench_B", "wrench_received", backward)
@@ -120,8 +120,8 @@ def network_delay_periods(scenario: Scenario) -> tuple[int, int]:
 def two_port_along(system: Linearization, omega: Array, hand: Array, tool: Array) -> Complex:
     """Return the hybrid matrix H (n, 2, 2) along one direction at nonzero `omega` (n,) [rad/s].
 
-    `system` has the hand's loop open in this direction. H includes the hand's mass. `hand` and
-    `tool` (6,) are the vectors of `TaskDirection`.
+    `system` has the hand's loop open in this direction. H includes the hand's mass. `hand` (6,) is
+    the direction at E in B, `tool` (6,) the wrench in W of a unit force at the tip.
     """
     G = system.frequency_response(omega)
     i, o = list(system.inputs), list(system.outputs)
@@ -194,7 +194,7 @@ class _PeriodSimulator:
         self._command_step = min(_ANGLE_STEP, _MAX_ACCELERATION_OF_COMMAND_STEP_RAD_S2 / gain)
         self._joint_step = self._command_step
         if smooth.surroundings is not None:
-            self._joint_step = min(self._command_step, _MAX_JOINT_DIFFERENCE_STEP_IN_CONTACT)
+            self._joint_step = min(self._command_step, _MAX_JOINT_DIFFERENCE_STEP_IN_CONTACT_RAD)
         hand = smooth.operator.hand
         self._device = smooth.master.device(hand.mass, hand.inertia)
         self._groups = self._make_state_groups()
@@ -373,7 +373,7 @@ class _PeriodSimulator:
             return self._simulate_period_and_get_state()
 
         pose, tool = np.full(6, self._command_step), np.full(6, _LINEAR_STATE_STEP)
-        steps = np.concatenate([_WRENCH_DIFFERENCE_STEPS, pose, _WRENCH_DIFFERENCE_STEPS, tool])
+        steps = np.concatenate([_WRENCH_STEPS_N_NM, pose, _WRENCH_STEPS_N_NM, tool])
         return _central_difference_jacobian(end_state, steps)
 
 

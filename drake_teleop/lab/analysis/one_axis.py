@@ -52,7 +52,7 @@ class AxisParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class OneAxis(AxisParameters):
-    """One-axis parameters with damping of device and wall, mass error, motion scale and delay.
+    """One-axis parameters, also damping of device and wall, mass error, motion scale, delay.
 
     Fields may be arrays, which broadcast.
     """
@@ -65,7 +65,7 @@ class OneAxis(AxisParameters):
 
     @property
     def displayed_tool_mass(self) -> float:
-        """Tool mass [kg] in the displayed force after compensation of the estimated mass."""
+        """Tool mass [kg] in the displayed force after subtraction of the estimated mass."""
         return self.sigma * self.tool_mass + (self.sigma - self.gamma) * self.mass_error
 
 

@@ -1,6 +1,6 @@
 """Sampled one-axis model of the station over a hand period, 1 / `Sampling.hand_hz`.
 
-All updates at one instant read earlier values. Device and servo hold their forces; the sensor
+Updates at one instant use values from before it. Device and servo hold their forces; the sensor
 samples just before the servo's update.
 """
 
@@ -24,7 +24,7 @@ from drake_teleop.station.sensor.sensor_chain import butterworth_sections
 (MASTER_X, MASTER_V, SERVO_A, SLAVE_X, SLAVE_V, SAMPLED_FORCE, FIRST_FILTER_STATE) = range(7)
 # After the states: the held inputs, and the force received where the loop is cut.
 _HELD_HAND_FORCE, _HELD_ENVIRONMENT_FORCE, RECEIVED_FORCE = -3, -2, -1
-_MAX_RATIO_TO_HAND_RATE = 1000  # over the hand's rate
+_MAX_RATE_RATIO_TO_HAND = 1000  # over the hand's rate
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,10 @@ def one_way_delay_in_hand_periods(axis: OneAxis, sampling: Sampling) -> int:
     return max(steps, 1) if axis.delay > 0 else 0
 
 
-def period_map_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
-    """Return the one-axis model's transition matrix over one hand period, with its loop cut.
+def transition_matrix_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
+    """Return the one-axis transition matrix over a hand period, cut at the received force.
 
-    The matrix (..., n + 3, n + 3) maps n states, two held forces and the received force.
+    It maps n states, held hand and environment forces, received force: (..., n + 3, n + 3).
     """
     if axis.ideal_servo:
         what = "the sampled model does not include an ideal servo"
@@ -62,12 +62,14 @@ def period_map_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
     shape = np.broadcast_shapes(*map(np.shape, parameters.values()))
     zeros = np.zeros((*shape, n + 3, n + 3))
     two_rows = zeros[..., :2, :]
-    hand = _hand_map_rows(two_rows, axis, hand_period)
-    servo = _servo_map_row(zeros[..., :1, :], axis)
-    sensor = _sensor_map_rows(zeros[..., SAMPLED_FORCE:n, :], axis, sections)
+    hand = _hand_transition_rows(two_rows, axis, hand_period)
+    servo = _servo_transition_row(zeros[..., :1, :], axis)
+    sensor = _sensor_transition_rows(zeros[..., SAMPLED_FORCE:n, :], axis, sections)
     times = sorted({Fraction(k, m) for m in (servo_samples, sensor_samples) for k in range(m)})
     gaps = [end - time for time, end in itertools.pairwise([*times, Fraction(1)])]
-    slave = {gap: _slave_map_rows(two_rows, axis, float(gap) * hand_period) for gap in set(gaps)}
+    slave = {
+        gap: _slave_transition_rows(two_rows, axis, float(gap) * hand_period) for gap in set(gaps)
+    }
     M = zeros + np.eye(n + 3)
     for time, gap in zip(times, gaps, strict=True):
         new = M.copy()
@@ -84,7 +86,7 @@ def period_map_of_cut_loop(axis: OneAxis, sampling: Sampling) -> Array:
 
 def cut_axis_model(axis: OneAxis, sampling: Sampling) -> Linearization:
     """Return the linear one-axis model, cut at the received force, without delay."""
-    M = period_map_of_cut_loop(axis, sampling)
+    M = transition_matrix_of_cut_loop(axis, sampling)
     n = M.shape[-1] - 3
     return Linearization(
         M[:n, :n],
@@ -131,11 +133,11 @@ def _samples_per_hand_period(sampling: Sampling, name: str) -> int:
     hand_hz = np.asarray(sampling.hand_hz, dtype=float)
     ratios = np.asarray(getattr(sampling, name) / hand_hz, dtype=float)
     count = round(float(ratios.flat[0]))
-    fits = (np.abs(ratios - count) <= 1e-9 * count) & (1 <= count <= _MAX_RATIO_TO_HAND_RATE)
+    fits = (np.abs(ratios - count) <= 1e-9 * count) & (1 <= count <= _MAX_RATE_RATIO_TO_HAND)
     if not fits.all():
         wrong = float(ratios[~fits].flat[0])
         what = f"is {wrong:.10g} times hand_hz (must be one whole multiple for all values)"
-        remedy = f"choose hand_hz times a whole number from 1 to {_MAX_RATIO_TO_HAND_RATE}"
+        remedy = f"choose hand_hz times a whole number from 1 to {_MAX_RATE_RATIO_TO_HAND}"
         raise DrakeTeleopError(what, where=f"sampling.{name}", remedy=remedy)
     return count
 
@@ -153,9 +155,9 @@ def _low_pass_sections(sampling: Sampling) -> Array:
     return sections.reshape(*rates.shape, 2, 5)
 
 
-def _hand_map_rows(zero_rows: Array, axis: OneAxis, period: Array) -> Array:
+def _hand_transition_rows(zero_rows: Array, axis: OneAxis, period: Array) -> Array:
     rows, mass = zero_rows.copy(), axis.hand_mass + axis.device_mass
-    responses = mass_spring_responses_to_unit_x_v_u(0.0, axis.device_damping / mass, period)
+    responses = mass_spring_unit_responses(0.0, axis.device_damping / mass, period)
     rows[..., [MASTER_X, MASTER_V]] = responses[..., :2]
     forces = {MASTER_X: -axis.hand_stiffness, MASTER_V: -axis.hand_damping}
     for column, force in (forces | {_HELD_HAND_FORCE: 1, RECEIVED_FORCE: -1}).items():
@@ -163,7 +165,7 @@ def _hand_map_rows(zero_rows: Array, axis: OneAxis, period: Array) -> Array:
     return rows
 
 
-def _servo_map_row(zero_row: Array, axis: OneAxis) -> Array:
+def _servo_transition_row(zero_row: Array, axis: OneAxis) -> Array:
     row, kv, kp = zero_row.copy(), axis.velocity_gain, axis.position_gain
     row[..., 0, MASTER_X] = kv * kp * axis.position_scale
     row[..., 0, SLAVE_X] = -kv * kp
@@ -171,7 +173,7 @@ def _servo_map_row(zero_row: Array, axis: OneAxis) -> Array:
     return row
 
 
-def _sensor_map_rows(zero_rows: Array, axis: OneAxis, sections: Array) -> Array:
+def _sensor_transition_rows(zero_rows: Array, axis: OneAxis, sections: Array) -> Array:
     rows, displayed_mass = zero_rows.copy(), axis.displayed_tool_mass
     scale = axis.force_scale * (axis.gamma - displayed_mass / axis.slave_mass)
     value = rows[..., 0, :]
@@ -190,18 +192,16 @@ def _sensor_map_rows(zero_rows: Array, axis: OneAxis, sections: Array) -> Array:
     return rows
 
 
-def _slave_map_rows(zero_rows: Array, axis: OneAxis, time: Array) -> Array:
+def _slave_transition_rows(zero_rows: Array, axis: OneAxis, time: Array) -> Array:
     rows, mass = zero_rows.copy(), axis.slave_mass
     springs = axis.wall_stiffness / mass, axis.wall_damping / mass
-    responses = mass_spring_responses_to_unit_x_v_u(*springs, time)
+    responses = mass_spring_unit_responses(*springs, time)
     rows[..., [SLAVE_X, SLAVE_V, SERVO_A]] = responses
     rows[..., _HELD_ENVIRONMENT_FORCE] = -responses[..., 2] / np.asarray(mass)[..., None]
     return rows
 
 
-def mass_spring_responses_to_unit_x_v_u(
-    stiffness: ArrayLike, damping: ArrayLike, time: ArrayLike
-) -> Array:
+def mass_spring_unit_responses(stiffness: ArrayLike, damping: ArrayLike, time: ArrayLike) -> Array:
     """Return (x, x') after `time` [s] with x'' = u - b x' - k x, as an array (..., 2, 3).
 
     Columns: responses to x = 1 or x' = 1 at the start, and to constant u = 1.

@@ -21,7 +21,7 @@ from drake_teleop.lab.analysis.one_axis import Complex, OneAxis, environment_imp
 
 _GRIP_COLOURS = {"light": COLOURS[3], "medium": COLOURS[4], "firm": COLOURS[1]}
 #: Parameter of a map -> label of its axis, factor to its unit, and scale.
-_AXIS_FORMAT_BY_MAP_PARAMETER = {
+_PLOT_AXIS_FORMAT_BY_MAP_PARAMETER = {
     "delay": ("round trip [ms]", 2e3, "linear"),
     "wall_stiffness": ("stiffness of the wall [kN/m]", 1e-3, "log"),
     "sigma": ("σ", 1.0, "linear"),
@@ -146,7 +146,7 @@ def draw_absolute_stability(curves: ReportCurves) -> Figure:
         figure = Picture(figsize=(9.0, 3.6))
         left, right = figure.subplots(1, 2)
         left.semilogx(hertz, absolute_stability.llewellyn_parameter(curves.H), color=COLOURS[0])
-        left.set(ylim=(-1.2, 5.0), title="Llewellyn's parameter: absolutely stable from 1 on")
+        left.set(ylim=(-1.2, 5.0), title="Llewellyn's parameter (absolutely stable if >= 1)")
         realistic = f"hands from light to firm, walls up to {stiffest / 1e3:.3g} kN/m: μ"
         mu = absolute_stability.structured_singular_value(S)
         for label, value, colour in (
@@ -185,7 +185,7 @@ def draw_z_widths(curves: ReportCurves, z_width: Mapping[str, Any]) -> Figure:
         for label, (key, colour) in shown.items():
             right.plot(damping, [1e-3 * row[key] for row in walls], color=colour, label=label)
         right.set(xlabel="damping of the virtual wall [N s/m]", ylabel="stiffness [kN/m]")
-        right.set_title(f"Virtual walls of the device at {z_width['rate_Hz'] / 1e3:g} kHz")
+        right.set_title(f"Virtual walls, sampled at {z_width['rate_Hz'] / 1e3:g} kHz")
         right.legend()
     return figure
 
@@ -211,8 +211,8 @@ def draw_stability_maps(curves: ReportCurves, grip: str) -> Figure:
 
 def _draw_stability_map(axes: Axes, map_of_grip: Mapping[str, StabilityMap], grip: str) -> Any:
     one = map_of_grip[grip]
-    x_label, x_factor, x_scale = _AXIS_FORMAT_BY_MAP_PARAMETER[one.x_name]
-    y_label, y_factor, y_scale = _AXIS_FORMAT_BY_MAP_PARAMETER[one.y_name]
+    x_label, x_factor, x_scale = _PLOT_AXIS_FORMAT_BY_MAP_PARAMETER[one.x_name]
+    y_label, y_factor, y_scale = _PLOT_AXIS_FORMAT_BY_MAP_PARAMETER[one.y_name]
     x, y = x_factor * one.x, y_factor * one.y
     distortion = np.ma.masked_where(~one.stable, np.clip(one.distortion, 0.01, 1.0))
     axes.set_facecolor("#D5D8DD")

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from drake_teleop.common.numeric import Array, finite_array, nonnegative_array, positive_array
 from drake_teleop.lab.analysis.one_axis import Complex
-from drake_teleop.lab.analysis.period_map import mass_spring_responses_to_unit_x_v_u
+from drake_teleop.lab.analysis.period_map import mass_spring_unit_responses
 
 _NUM_STIFFNESS_BISECTIONS = 60
 
@@ -80,6 +80,6 @@ def _sampled_device_responses_to_unit_x_v_f(
     b = positive_array("damping", damping, *np.shape(damping))
     k = nonnegative_array("hand_stiffness", stiffness, *np.shape(stiffness))
     positive_array("period", period)
-    responses = mass_spring_responses_to_unit_x_v_u(k / m, b / m, period)
+    responses = mass_spring_unit_responses(k / m, b / m, period)
     responses[..., 2] /= m[..., None]
     return responses

@@ -1,6 +1,6 @@
 """Parameters of the one-axis model along a task direction.
 
-One axis represents the station if contact does not rotate the tool, as for forces along it.
+One axis represents the station only if forces on the tip do not rotate the tool.
 """
 
 from __future__ import annotations

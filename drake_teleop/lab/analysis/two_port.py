@@ -35,7 +35,7 @@ def hybrid_matrix(
 ) -> Complex:
     """Return the hybrid matrix H (..., 2, 2) of the position-force station at s [rad/s] (T51).
 
-    `servo` = (response, admittance) replaces those of `axis`.
+    `servo` = (response, admittance) at s replaces the servo of `axis`.
     """
     servo = servo or (one_axis.servo_response(axis, s), one_axis.servo_admittance(axis, s))
     response, slave_admittance = servo
@@ -76,7 +76,7 @@ def reference_impedances(axis: OneAxis) -> tuple[float, float]:
 
 
 def power_ratio(axis: OneAxis) -> float:
-    """Return the hand's power over the slave's: force scale times gamma over motion scale."""
+    """Return hand power / slave power = force scale * gamma / motion scale."""
     return axis.force_scale * axis.gamma / axis.position_scale
 
 
@@ -112,7 +112,7 @@ def transmitted_impedance(H: Complex, environment: ArrayLike) -> Complex:
 
 
 def ideal_impedance(axis: OneAxis, s: Complex, environment: ArrayLike) -> Complex:
-    """Return the displayed impedance [N s/m] of an ideal station with the axis' scales (T52)."""
+    """Return the displayed impedance [N s/m] without servo lag and delay, with scales (T52)."""
     rendered = axis.gamma * np.asarray(environment) + axis.sigma * axis.tool_mass * s
     return one_axis.device_impedance(axis, s) + axis.force_scale * axis.position_scale * rendered
 

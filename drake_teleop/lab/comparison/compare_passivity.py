@@ -47,7 +47,7 @@ SIGMAS = (0.0, 1.0)
 _NUM_TAPS, _TAP_AMPLITUDE_ABOUT_WALL_M = 8, 0.03  # number; m, amplitude about the wall's surface
 _INJECTED_ENERGY_STUDY_CASES = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
 #: Rates of every run: a quarter (sensor) or half of those of the shipped scenarios.
-_COMPARISON_RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
+_SAMPLE_RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
 #: Step [s], longer than the events' period; else tiny steps (rounding) precede the events.
 _MAX_SIMULATION_STEP_S = 2e-3
 
@@ -80,7 +80,7 @@ def compare_command(
         METHODS.check(name, "methods")
     if "ideal" in networks and "none" in methods:
         what = "method 'none' over network 'ideal' has no channel that measures energy"
-        raise DrakeTeleopError(what, where="networks", remedy="remove the network or the method")
+        raise DrakeTeleopError(what, where="networks", remedy="remove 'ideal' or 'none'")
     base = base_scenario(scenario, seed)  # before the work, as the folder: errors come early
     for method in methods:  # else each of its runs would count as unstable
         settings = Channel(network=networks[0]), PassivityConfig(method=method)
@@ -109,7 +109,7 @@ def compare_command(
     # Workers import this module without matplotlib and polars.
     import polars as pl
 
-    from drake_teleop.lab.comparison.report import decision_table, print_tables, write_report
+    from drake_teleop.lab.comparison.report import print_tables, stability_table, write_report
 
     summary["decision"] = [
         {
@@ -120,7 +120,7 @@ def compare_command(
             "pressed_N": [pressed for _, pressed in cell.force_pairs],
             "leaked_J": cell.leaked_J,
         }
-        for (method, network), cell in decision_table(summary).items()
+        for (method, network), cell in stability_table(summary).items()
     ]
     with output_folder(out):
         write_table(out / "runs.parquet", pl.DataFrame(runs, infer_schema_length=None))
@@ -131,12 +131,12 @@ def compare_command(
     return summary
 
 
-def longest_round_trip(
+def longest_stable_round_trip(
     method: str, model: OneDof, jitter: float, loss: float, seeds: Sequence[int]
 ) -> float:
-    """Return the longest of `ROUND_TRIPS_S` [s] up to which all runs are stable; 0: none.
+    """Return the longest round trip [s] up to which all runs are stable; 0: none.
 
-    Without `jitter` and `loss` only the first seed runs.
+    Without `jitter` (share of the delay) and `loss` (probability) only the first seed runs.
     """
     longest = 0.0
     for round_trip in ROUND_TRIPS_S:
@@ -150,13 +150,13 @@ def longest_round_trip(
 
 
 def base_scenario(scenario: str | Path, seed: int) -> Scenario:
-    """Return the scenario at the comparison's rates, without environment, detection, estimator."""
+    """Return the scenario without environment, contact detection and load estimator."""
     given = LoadScenario(scenario).without_environment()
     check_can_press(given)
     return replace(
         given,
         simulation=Simulation(seed=seed, max_step=_MAX_SIMULATION_STEP_S),
-        rates=_COMPARISON_RATES,
+        rates=_SAMPLE_RATES,
         contact_detection=None,
         load_estimator=LoadEstimatorConfig(),  # contact would count as load
     )
@@ -165,7 +165,7 @@ def base_scenario(scenario: str | Path, seed: int) -> Scenario:
 def simulate_press(
     scenario: Scenario, method: str, network: str, leaf: str, estimate: Array
 ) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Simulate a press on a sheet spring; return its measures (table row) and time series."""
+    """Simulate a press on a sheet spring (`leaf`); return measures (a row) and time series."""
     row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
     names = [entry.name for entry in dataclasses.fields(RunMeasures)]
     names += ["pressed_force", "felt_share", "left_behind", "leaked", "fast_force"]
@@ -211,7 +211,7 @@ def _simulate_press_while_stable(
 
 @dataclass(frozen=True)
 class ReleaseAndTaps:
-    """Measures after the hand releases the device, and while it taps a wall, all >= 0."""
+    """Nonnegative measures: motion after release of the device, impulses of taps, leaked energy."""
 
     release_force: float  #: mean magnitude of the force on the hand, 0.1 s before release [N]
     release_speed: float  #: largest speed of the device in the 2 s after release [m/s]
@@ -280,12 +280,12 @@ def _run_longest_round_trip_study(
     product = itertools.product(methods, WALL_STIFFNESSES_N_M, JITTER_AND_LOSS_PAIRS)
     cases = [(method, wall, *pair) for method, wall, pair in product]
     # Compile here once, so that the parallel processes read the cache.
-    longest_round_trip(methods[0], OneDof(), 0.0, 0.0, [seed])
+    longest_stable_round_trip(methods[0], OneDof(), 0.0, 0.0, [seed])
     for method in methods:
         step_addresses(method)
     seeds = [seed, seed + 1]
     runs = [(method, OneDof(wall_stiffness=wall), *pair, seeds) for method, wall, *pair in cases]
-    found = _run_in_processes(longest_round_trip, runs, jobs, stage("One degree of freedom"))
+    found = _run_in_processes(longest_stable_round_trip, runs, jobs, stage("One degree of freedom"))
     names, grid = ("method", "wall_N_per_m", "jitter", "loss"), list(ROUND_TRIPS_S)
     return [
         dict(zip(names, case, strict=True)) | {"longest_s": longest, "grid_s": grid}

@@ -57,7 +57,7 @@ class Task:
     rest_window: float = 1.9  #: length of the windows in which rest is required
 
     def is_held(self, t: Array) -> NDArray[np.bool_]:
-        """Return whether times (N,) [s] are in the rest window, the last part of the hold."""
+        """Return whether times (N,) [s] are in the last `rest_window` of the hold."""
         return (t >= self.release_start - self.rest_window) & (t < self.release_start)
 
 
@@ -99,8 +99,8 @@ at 12 instead of 14 Hz, delay 17 instead of 13 ms.
 class OneDofRun:
     """Time series (N,) of a run.
 
-    `input_energies` (N, 4) is the energy [J] put into the station so far at four places, at the
-    master's scale. In a passive station, AT_HAND plus any other is at least -start_energy::
+    `input_energies` (N, 4) is the energy [J] put into the station so far at four places, scaled to
+    the master. In a passive station, AT_HAND plus any other is at least -start_energy::
 
         AT_HAND     -sum f_(k-1) (x_k - x_(k-1))   f: displayed force, held
         AT_COMMAND   sum w_k (c_k - c_(k-1))       w: sent wrench; c: command; no physical port
@@ -120,7 +120,7 @@ class OneDofRun:
     start_energy: float  #: E_0 of the method's stores [J]
 
     def least_energy_sum(self, place: int) -> float:
-        """Return the minimum over time [J] of start energy plus input at AT_HAND and `place`.
+        """Return the minimum [J] of start energy plus input at the hand and a place (column).
 
         Negative: the station is active.
         """
@@ -278,8 +278,8 @@ def measures_of_traces(
     rest = window_slice(task.end - task.rest_window, task.end)
     swing = window_slice(task.swing_start, task.swing_end)
     parts, angles = (hold, rest), () if turned is None else turned.T
-    hunting = max(_range_about_parabola(x[part]) for x in (master, slave) for part in parts)
-    turning = max((_range_about_parabola(x[part]) for x in angles for part in parts), default=0.0)
+    hunting = max(_detrended_peak_to_peak(x[part]) for x in (master, slave) for part in parts)
+    turning = max((_detrended_peak_to_peak(x[part]) for x in angles for part in parts), default=0.0)
     steady, goal = float(hand_force[hold].mean()), float(pressed[hold].mean())
     after = min(round((task.release_end + 2.0) / dt), len(t) - 1)
     start = round(task.press_start / dt)
@@ -318,7 +318,7 @@ def _displayed_impedance_real_part(model: OneDof, round_trip: float) -> Array:
     return np.asarray(displayed.real)
 
 
-def _range_about_parabola(x: Array) -> float:
+def _detrended_peak_to_peak(x: Array) -> float:
     if not np.isfinite(x).all():
         return float("inf")
     t = np.linspace(-1.0, 1.0, len(x))
@@ -336,8 +336,8 @@ def _rise_delay_in_samples(hand_force: Array, contact_force: Array, steady_force
 
 @njit(cache=True)
 def _simulate_one_dof_run(
-    method_steps, model, holds_motor_force, method_parameters, forward_line, backward_line,
-    forward, backward, end_states, start, timeout, inputs,
+    method_steps, model, holds_motor_force, method_parameters, forward_network, backward_network,
+    forward_state, backward_state, channel_end_states, start, timeout, inputs,
 ):  # fmt: skip
     device_mass, friction, slave_mass, K, D, ideal, slave_friction, lag = model[:8]
     tool_mass, wall_damping, scale, sigma, gamma = model[8:13]
@@ -369,8 +369,8 @@ def _simulate_one_dof_run(
         # A literal False would compile the whole channel once more.
         step_channel(
             method_steps, pose_m, wrench, load, hand, pose_s, np.bool_(False), 0.0, PERIOD_S,
-            timeout, frame, method_parameters, forward_line, backward_line, forward, backward,
-            end_states, received, ports, displayed,
+            timeout, frame, method_parameters, forward_network, backward_network, forward_state,
+            backward_state, channel_end_states, received, ports, displayed,
         )  # fmt: skip
         command, energies[AT_COMMAND] = received[4], ports[6]
         copy_into(rows[k], 0, (x, x_s, command, displayed[0], wall, ports[0], ports[2]), 0, 7)

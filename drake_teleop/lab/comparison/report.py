@@ -100,7 +100,7 @@ class MethodResult:
         return f"{min(shares):.0%}" if shares else ""
 
 
-def decision_table(summary: Mapping[str, Any]) -> dict[tuple[str, str], MethodResult]:
+def stability_table(summary: Mapping[str, Any]) -> dict[tuple[str, str], MethodResult]:
     """Return the result for each (method, network) of a summary."""
     table = {}
     for row in summary["hands"]:
@@ -141,7 +141,7 @@ def _format_two_significant_digits(number: float) -> str:
 
 
 def draw_decision_table(summary: Mapping[str, Any]) -> Figure:
-    methods, networks, table = summary["methods"], summary["networks"], decision_table(summary)
+    methods, networks, table = summary["methods"], summary["networks"], stability_table(summary)
     with plot_style():
         figure = Picture(figsize=(1.75 * len(networks) + 1.5, 0.72 * len(methods) + 1.1))
         axes = figure.subplots()
@@ -266,8 +266,8 @@ def print_tables(summary: Mapping[str, Any], out: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    console, table = Console(), decision_table(summary)
-    grid = Table(title="Rendered share of the contact force", title_justify="left", box=SIMPLE_HEAD)
+    console, table = Console(), stability_table(summary)
+    grid = Table(title="Displayed / scaled contact force", title_justify="left", box=SIMPLE_HEAD)
     grid.add_column("Method", no_wrap=True)
     for network in summary["networks"]:
         grid.add_column(f"{network}\n{2e3 * PRESETS[network].delay:g} ms", overflow="fold")

@@ -1,7 +1,7 @@
 """The whole station: task (swing, press on a sheet spring, rest), measures and energy balances.
 
-The balances are those of `OneDofRun.input_energies`, at the master's scale, positive inwards [J],
-for translation and rotation. AT_MOTOR is computed from motor torque minus gravity torque.
+Energies [J] are put in at hand, command, motors and slave, in units of the master's side, for
+translation and rotation. The motors' energy is from motor torque minus gravity torque.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ def force_and_energy_traces(result: SimulationResult, scenario: Scenario) -> dic
 
 
 def injected_energy(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the energy (N,) [J] that hand and environment put in so far, plus `start_energy`."""
+    """Return the start energy plus the energy (N,) [J] put in so far by hand and environment."""
     energies = station_energies(result, scenario)[:, [AT_HAND, AT_SLAVE]].sum(axis=1)
     if any(scenario.force_scaling.scales().load_scales):
         energies += work_of_displayed_load_wrench(result, scenario)
@@ -153,9 +153,9 @@ def _slave_height_and_rotation(result: SimulationResult, scenario: Scenario) -> 
 
 
 def station_energies(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the energies (N, 4, 2) [J] put in so far at four places, by translation and rotation.
+    """Return energies (N, place, translation or rotation) [J] put in so far; AT_HAND to AT_SLAVE.
 
-    Places: AT_HAND to AT_SLAVE. AT_MOTOR is NaN if the log is slower than the joint control.
+    AT_MOTOR is NaN if the log is slower than the joint control.
     """
     needed = ("ports", "slave_state", "joint_torque")
     if missing := [name for name in needed if name not in result]:
@@ -170,7 +170,7 @@ def station_energies(result: SimulationResult, scenario: Scenario) -> Array:
         force, torque = np.split(result["true_contact_wrench_W"], 2, axis=1)
         contact = np.hstack([force, torque - np.cross(poses[:, 4:], force)])
     gamma = scenario.force_scaling.scales().gamma
-    power = scenario.force_scaling.force_scale * gamma / _kinematic_scales_with_1_for_0(scenario)
+    power = scenario.force_scaling.force_scale * gamma / _nonzero_kinematic_scales(scenario)
     rates = scenario.rates
     energies = np.empty((len(t), 4, 2))
     # A row contains the torque of the period before the row.
@@ -208,7 +208,7 @@ def work_of_displayed_load_wrench(result: SimulationResult, scenario: Scenario) 
     wrench = -non_contact_wrench(motion[:, :3], motion[:, 3:6], motion[:, 6:9], kept)
     wrench -= non_contact_wrench(-gravity, rest, rest, excess)
     at_So = (R_WS @ wrench.reshape(-1, 2, 3, 1)).reshape(-1, 6)
-    power = scenario.force_scaling.force_scale / _kinematic_scales_with_1_for_0(scenario)
+    power = scenario.force_scaling.force_scale / _nonzero_kinematic_scales(scenario)
     return np.asarray(power * port_work(at_So, poses, "mean"))
 
 
@@ -217,14 +217,14 @@ def start_energy(scenario: Scenario) -> Array:
 
     Columns: translation, rotation.
     """
-    scales = _kinematic_scales_with_1_for_0(scenario)
+    scales = _nonzero_kinematic_scales(scenario)
     power = scenario.force_scaling.force_scale / scales
     p = methods.method_parameters(scenario.passivity, list(power), list(scales))
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     return 2 * methods.initial_method_memory(scenario.passivity.method, p, pose)[STORED_ENERGY]
 
 
-def _kinematic_scales_with_1_for_0(scenario: Scenario) -> Array:
+def _nonzero_kinematic_scales(scenario: Scenario) -> Array:
     scales = scenario.kinematic_scaling.scales
     return np.where(scales > 0.0, scales, 1.0)
 

@@ -96,7 +96,7 @@ _NUM_COAXIALITY_POSTURES = 20
 _NEAR_CONTACT_GAPS_M, _CAPSULE_EXCESS_QUANTILE, _BLOCKABLE_POSTURE_SHARE = (-0.02, 0.05), 0.25, 0.1
 _MIN_NUM_POSTURES_NEAR_CONTACT = 5  # for a correction
 # Pairs whose capsules are near in fewer postures count although their shapes were never near.
-_MAX_POSTURE_SHARE_OF_RARE_CONTACT = 0.05
+_RARE_CONTACT_POSTURE_SHARE = 0.05
 
 _TABLE_SHAPE_NAME = "drake_teleop_table"
 # Replaces a half space, for which Drake has no distances; wider than any arm.
@@ -142,8 +142,7 @@ class CollisionScene:
     ) -> tuple[dict[_ShapePair, Array], list[str]]:
         """Return distances (T,) [m] by pair that may collide, and names of body pairs in contact.
 
-        Excluded pairs are on one link, almost always near, at constant distance, or in contact at
-        `start`.
+        Excluded: pairs on one link, almost always near, at constant distance, touching at `start`.
         """
         manager = self.scene_graph.collision_filter_manager()
         for link in set(self._rows.values()):
@@ -187,7 +186,7 @@ class CollisionScene:
     def bounding_capsules_and_pairs(
         self, candidates: dict[_ShapePair, Array], postures: Array
     ) -> dict[str, NDArray[Any]]:
-        """Return the `Limits` fields of the shapes' bounding capsules and their candidate pairs."""
+        """Return `Limits` fields `capsule_*` of shapes, and of their pairs that may collide."""
         inspector = self.scene_graph.model_inspector()
         context = self.diagram.CreateDefaultContext()
         plant_context = self.plant.GetMyContextFromRoot(context)
@@ -232,7 +231,7 @@ class CollisionScene:
                 useful = np.mean(capsules_near[near]) > np.mean(capsules_near[~near])
             else:
                 near_share = np.mean(capsule_distances[:, k] < MIN_CLEARANCE_M)
-                useful = near.any() or 0 < near_share < _MAX_POSTURE_SHARE_OF_RARE_CONTACT
+                useful = near.any() or 0 < near_share < _RARE_CONTACT_POSTURE_SHARE
             if useful:
                 used.append(k)
                 distances.append(distance)

@@ -1,7 +1,7 @@
 """Criteria of an excitation: condition numbers of the regressor V, A- and D-optimality (T45).
 
 =========== ====================================================================================
-kappa_w10   rows of V over noise sigma, columns times 1, L, L^2 (`CriterionScales`). Default.
+kappa_w10   V, rows divided by noise, columns times 1, L, L^2 (`CriterionScales`). Default.
 kappa10     V (10 columns) in SI units.
 kappa16     [1 V] (16 columns) in SI units.
 A16         rms of predicted over acceptable errors of phi, estimated with the offsets.
@@ -71,7 +71,7 @@ class Criterion:
         self._columns = columns
 
     def rows_and_information(self, s: Array, omega: Array, alpha: Array) -> tuple[Array, Array]:
-        """Return the scaled regressor (6 T, c) and its information matrix (c, c), a mean over T."""
+        """Return scaled regressor rows (6 T, columns) and mean information of one sample."""
         V = regressor(s, omega, alpha)
         if self.with_offsets:
             V = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
@@ -92,9 +92,9 @@ class Criterion:
     def smooth_log_and_gradient(
         self, s: Array, omega: Array, alpha: Array, sharpness: float
     ) -> tuple[float, Array]:
-        """Return the logarithm of the smooth criterion and its gradient by the regressor V.
+        """Return log criterion, without the constant factor of duration, and its gradient by V.
 
-        The constant factor of the duration is omitted.
+        A larger `sharpness` brings smooth maxima closer to the exact ones.
         """
         rows, gram = self.rows_and_information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
@@ -124,7 +124,7 @@ class Criterion:
 
 @njit(cache=True)
 def write_gradients_by_motion(omega, g_V, g_s, g_omega, g_alpha):
-    """Write gradients (3,) by s, omega, alpha of a scalar with gradient g_V by the regressor V."""
+    """Write dJ/ds, dJ/domega, dJ/dalpha (3,) into g_s, g_omega, g_alpha, from g_V = dJ/dV."""
     g_s[0] = g_V[0, 0] + g_V[4, 3] - g_V[5, 2]
     g_s[1] = g_V[1, 0] - g_V[3, 3] + g_V[5, 1]
     g_s[2] = g_V[2, 0] + g_V[3, 2] - g_V[4, 1]

@@ -30,7 +30,7 @@ _FALLBACK_AMPLITUDE_FACTORS, _NUM_FALLBACK_MOTIONS = (1.0, 0.7, 0.5, 0.35, 0.25,
 _ADVICE_BY_LIMIT = {
     "clearance": "; or, if the convex hulls of meshes touch, excite a station (drake-teleop new): "
     "shapes that touch in its start posture are ignored",
-    **dict.fromkeys(("sensor", "torque"), "; or a smaller --payload, or another sensor or start"),
+    **dict.fromkeys(("sensor", "torque"), "; or change --payload, sensor or start posture"),
 }
 
 
@@ -71,9 +71,9 @@ def excite(
     """
     scaled = Criterion(criterion, robot.criterion_scales)
     if _num_sensor_rotation_axes(robot.arm) < 2:
-        what = "the joints rotate the sensor about fewer than two axes, so no motion excites"
+        what = "no motion excites all parameters: joints rotate the sensor about at most one axis"
         remedy = "use an arm with two, or pass a known load_estimate to MakeTeleopStation (Python)"
-        raise DrakeTeleopError(f"{what} all parameters", where=robot.name, remedy=remedy)
+        raise DrakeTeleopError(what, where=robot.name, remedy=remedy)
     with show_progress(progress) as stage:
         report = stage("Design the trajectory")
 
@@ -91,7 +91,7 @@ def excite(
     if not np.isfinite(excitation.values[criterion]):
         what = "the largest motion that was found within all limits does not excite all parameters"
         remedy = "raise this limit, or give more --time, a longer --period or another --seed"
-        raise DrakeTeleopError(f"{what}; it uses {uses[0]}", where=robot.name, remedy=remedy)
+        raise DrakeTeleopError(f"{what}; limit use: {uses[0]}", where=robot.name, remedy=remedy)
     return excitation
 
 

@@ -13,12 +13,12 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import dot, minus, plus, scale_vector, vector_at
 from drake_teleop.lab.excitation.criteria import write_gradients_by_motion
 from drake_teleop.lab.excitation.link_gradients import (
-    ADJOINT_SEED_SIZE,
-    add_point_to_seed,
-    add_torque_to_seeds,
-    add_vector_to_seed,
-    add_wrench_to_seed,
-    pull_back_seeds,
+    ADJOINT_SIZE,
+    add_point_to_adjoint,
+    add_torque_to_adjoints,
+    add_vector_to_adjoint,
+    add_wrench_to_adjoint,
+    pull_back_adjoints,
     rotate_to_link,
     rotate_to_world,
 )
@@ -28,9 +28,9 @@ from drake_teleop.station.slave.arm import SENSOR_MOTION_SIZE, inverse_dynamics,
 LIMIT_NAMES = ("position", "velocity", "acceleration", "torque", "sensor", "workspace", "clearance")
 
 #: Distance beyond the clearance at which the use of the clearance is 0 [m].
-ZERO_USE_CLEARANCE_MARGIN_M = 0.1
-_MIN_SMOOTH_MAXIMUM_WEIGHT = 1e-7  # smaller weights in a smooth maximum's gradient are skipped
-_FAR_CAPSULE_SUBSTITUTE_DISTANCE_M = 1.0  # replaces distances with zero clearance use [m]
+CLEARANCE_USE_RANGE_M = 0.1
+_NEGLIGIBLE_GRADIENT_WEIGHT = 1e-7  # smaller weights in a smooth maximum's gradient are skipped
+_DISTANCE_OF_FAR_CAPSULES_M = 1.0  # replaces distances with zero clearance use [m]
 
 
 class Limits(NamedTuple):
@@ -73,17 +73,17 @@ def finite_half_ranges(q_half: Array) -> Array:
 
 
 @njit(cache=True)
-def link_motion_series(table, q, qd, qdd):
-    """Return the motions [s, omega, alpha, p, R] in W of all links at T samples (T, n+1, 21)."""
+def link_motion_series(arm_table, q, qd, qdd):
+    """Return specific force to rotation [s, omega, alpha, p, R] of links in W (T, n+1, 21)."""
     motions = np.empty((len(q), q.shape[1] + 1, SENSOR_MOTION_SIZE))
     for t in range(len(q)):
-        link_motions(table, q[t], qd[t], qdd[t], motions[t])
+        link_motions(arm_table, q[t], qd[t], qdd[t], motions[t])
     return motions
 
 
 @njit(cache=True)
 def sensor_motion_series(motions):
-    """Return specific force, omega and alpha of the sensor, in S, as one array (3, T, 3)."""
+    """Return specific force, omega and alpha (3, T, 3) of the sensor in S, the last link."""
     out = np.empty((3, len(motions), 3))
     for t in range(len(motions)):
         for k in range(3):
@@ -93,8 +93,8 @@ def sensor_motion_series(motions):
 
 
 @njit(cache=True)
-def add_gradient_by_joints(table, motions, qd, qdd, g_V, gradient):
-    """Add to `gradient` derivatives by q, qd, qdd of a scalar with gradient g_V by regressor V."""
+def add_gradient_by_joints(arm_table, motions, qd, qdd, g_V, gradient):
+    """Add dJ/dq, dJ/dqd, dJ/dqdd to `gradient` (3, T, n), from g_V = dJ/dV (V: regressor)."""
     buffers, g = _allocate_gradient_buffers(motions), np.empty((3, 3))
     seed = buffers[0][-1]
     for t in range(len(motions)):
@@ -104,15 +104,15 @@ def add_gradient_by_joints(table, motions, qd, qdd, g_V, gradient):
         )
         seed[:] = 0.0
         for k in range(3):
-            add_vector_to_seed(motion, 3 * k, vector_at(g[k], 0), seed)
-        _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, buffers)
+            add_vector_to_adjoint(motion, 3 * k, vector_at(g[k], 0), seed)
+        _add_joint_gradients_at_sample(arm_table, qd, qdd, motions, t, gradient, buffers)
 
 
 @njit(cache=True)
-def max_limit_uses_into(table, q, qd, qdd, motions, limits, sharpness, gradient):
-    """Return the largest use of each of `LIMIT_NAMES` over all samples: smooth (7,), exact (7,).
+def max_limit_uses_into(arm_table, q, qd, qdd, motions, limits, sharpness, gradient):
+    """Return smooth and exact maxima over samples of value over limit, by `LIMIT_NAMES` (7,).
 
-    Write the gradient (7, 3, T, n) of the smooth uses by q, qd, qdd (T47).
+    Write the gradient (7, 3, T, n) of the smooth ones by q, qd, qdd (T, n) (T47).
     """
     gradient[:] = 0.0
     smooth, largest = np.empty(7), np.empty(7)
@@ -122,7 +122,7 @@ def max_limit_uses_into(table, q, qd, qdd, motions, limits, sharpness, gradient)
         use = np.abs(x) / scales[k]
         largest[k], smooth[k] = _exact_and_smooth_maximum(use, sharpness)
         gradient[k, k] = use * (np.sign(x) / scales[k])
-    samples = table, q, qd, qdd, motions
+    samples = arm_table, q, qd, qdd, motions
     largest[3], smooth[3] = _max_torque_use_into(samples, limits, sharpness, gradient[3])
     largest[4], smooth[4] = _max_sensor_use_into(samples, limits, sharpness, gradient[4])
     largest[5], smooth[5] = _max_workspace_use_into(samples, limits, sharpness, gradient[5])
@@ -148,46 +148,46 @@ def _exact_and_smooth_maximum(use, sharpness):
 
 @njit(cache=True)
 def _allocate_gradient_buffers(motions):
-    # Seeds, joint velocities and link velocities of virtual power, see `add_torque_to_seeds`.
+    # Seeds, joint velocities and link velocities of virtual power, see `add_torque_to_adjoints`.
     rows = motions.shape[1]
-    return np.zeros((rows, ADJOINT_SEED_SIZE)), np.zeros(rows - 1), np.zeros((rows, 6))
+    return np.zeros((rows, ADJOINT_SIZE)), np.zeros(rows - 1), np.zeros((rows, 6))
 
 
 @njit(cache=True)
-def _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, buffers):
-    seeds, c, virtual = buffers
-    pull_back_seeds(
-        table, motions[t], qd[t], qdd[t], c, virtual, seeds,
+def _add_joint_gradients_at_sample(arm_table, qd, qdd, motions, t, gradient, buffers):
+    seeds, weights, virtual = buffers
+    pull_back_adjoints(
+        arm_table, motions[t], qd[t], qdd[t], weights, virtual, seeds,
         gradient[0, t], gradient[1, t], gradient[2, t],
     )  # fmt: skip
 
 
 @njit(cache=True, inline="always")
 def _max_torque_use_into(samples, limits, sharpness, gradient):
-    table, q, qd, qdd, motions = samples
+    arm_table, q, qd, qdd, motions = samples
     tau = np.empty(q.shape)
     for t in range(len(q)):
-        inverse_dynamics(table, q[t], qd[t], qdd[t], tau[t])
+        inverse_dynamics(arm_table, q[t], qd[t], qdd[t], tau[t])
     use = np.abs(tau) / limits.max_torques
     maxima = _exact_and_smooth_maximum(use, sharpness)
     buffers = _allocate_gradient_buffers(motions)
-    seeds, c, virtual = buffers
+    seeds, weights, virtual = buffers
     for t in range(len(q)):
-        if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
+        if use[t].max() < _NEGLIGIBLE_GRADIENT_WEIGHT:
             continue
         seeds[:] = 0.0
-        c[:] = use[t] * np.sign(tau[t]) / limits.max_torques
+        weights[:] = use[t] * np.sign(tau[t]) / limits.max_torques
         # Table columns 22 and 23: rotor inertia and joint damping.
-        gradient[2, t] += c * table[:-1, 22]
-        gradient[1, t] += c * table[:-1, 23]
-        add_torque_to_seeds(table, motions[t], c, virtual, seeds)
-        _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, buffers)
+        gradient[2, t] += weights * arm_table[:-1, 22]
+        gradient[1, t] += weights * arm_table[:-1, 23]
+        add_torque_to_adjoints(arm_table, motions[t], weights, virtual, seeds)
+        _add_joint_gradients_at_sample(arm_table, qd, qdd, motions, t, gradient, buffers)
     return maxima
 
 
 @njit(cache=True, inline="always")
 def _max_sensor_use_into(samples, limits, sharpness, gradient):
-    table, _, qd, qdd, motions = samples
+    arm_table, _, qd, qdd, motions = samples
     sensor, size = sensor_motion_series(motions), np.empty((len(motions), 4))
     x = np.empty((len(motions), 12))  # force, torque, s, alpha in S
     x[:, 6:9], x[:, 9:] = sensor[0], sensor[2]
@@ -202,23 +202,23 @@ def _max_sensor_use_into(samples, limits, sharpness, gradient):
     buffers = _allocate_gradient_buffers(motions)
     seed = buffers[0][-1]
     for t in range(len(motions)):
-        if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
+        if use[t].max() < _NEGLIGIBLE_GRADIENT_WEIGHT:
             continue
         seed[:] = 0.0
         motion, g = motions[t, -1], x[t]
         for k in range(4):
             size_limit = limits.max_sensor_norms[k] * max(size[t, k], 1e-12)
             g[3 * k : 3 * k + 3] *= use[t, k] / size_limit
-        add_wrench_to_seed(motion, limits.heaviest_phi, vector_at(g, 0), vector_at(g, 3), seed)
-        add_vector_to_seed(motion, 0, vector_at(g, 6), seed)
-        add_vector_to_seed(motion, 6, vector_at(g, 9), seed)
-        _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, buffers)
+        add_wrench_to_adjoint(motion, limits.heaviest_phi, vector_at(g, 0), vector_at(g, 3), seed)
+        add_vector_to_adjoint(motion, 0, vector_at(g, 6), seed)
+        add_vector_to_adjoint(motion, 6, vector_at(g, 9), seed)
+        _add_joint_gradients_at_sample(arm_table, qd, qdd, motions, t, gradient, buffers)
     return maxima
 
 
 @njit(cache=True, inline="always")
 def _max_workspace_use_into(samples, limits, sharpness, gradient):
-    table, _, qd, qdd, motions = samples
+    arm_table, _, qd, qdd, motions = samples
     T, P = len(motions), len(limits.points_S)
     x = np.empty((T, P, 3))
     for t in range(T):
@@ -231,18 +231,18 @@ def _max_workspace_use_into(samples, limits, sharpness, gradient):
     buffers = _allocate_gradient_buffers(motions)
     seed = buffers[0][-1]
     for t in range(T):
-        if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
+        if use[t].max() < _NEGLIGIBLE_GRADIENT_WEIGHT:
             continue
         seed[:] = 0.0
         for k in range(P):
-            add_point_to_seed(motions[t, -1], limits.points_S[k], vector_at(by_x[t, k], 0), seed)
-        _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, buffers)
+            add_point_to_adjoint(motions[t, -1], limits.points_S[k], vector_at(by_x[t, k], 0), seed)
+        _add_joint_gradients_at_sample(arm_table, qd, qdd, motions, t, gradient, buffers)
     return maxima
 
 
 @njit(cache=True, inline="always")
 def _max_clearance_use_into(samples, limits, sharpness, gradient):
-    table, _, qd, qdd, motions = samples
+    arm_table, _, qd, qdd, motions = samples
     T, K = len(motions), len(limits.capsule_pairs)
     use, ends = np.empty((T, K)), np.empty((T, *limits.capsule_ends.shape))
     for t in range(T):
@@ -250,31 +250,31 @@ def _max_clearance_use_into(samples, limits, sharpness, gradient):
         for k in range(K):
             a, b = limits.capsule_pairs[k]
             reach = limits.capsule_radius[a] + limits.capsule_radius[b]
-            distance, far = _FAR_CAPSULE_SUBSTITUTE_DISTANCE_M, reach + ZERO_USE_CLEARANCE_MARGIN_M
+            distance, far = _DISTANCE_OF_FAR_CAPSULES_M, reach + CLEARANCE_USE_RANGE_M
             if not _are_segments_surely_apart(ends[t, a], ends[t, b], far):
                 distance = _nearest_points_of_segments(ends[t, a], ends[t, b])[0] - reach
             excess = distance - limits.min_pair_distances[k]
-            use[t, k] = 1.0 - excess / ZERO_USE_CLEARANCE_MARGIN_M
+            use[t, k] = 1.0 - excess / CLEARANCE_USE_RANGE_M
     maxima = _exact_and_smooth_maximum(use, sharpness)
     buffers = _allocate_gradient_buffers(motions)
     seeds = buffers[0]
     for t in range(T):
-        if use[t].max() < _MIN_SMOOTH_MAXIMUM_WEIGHT:
+        if use[t].max() < _NEGLIGIBLE_GRADIENT_WEIGHT:
             continue
         seeds[:] = 0.0
         for k in range(K):
-            if use[t, k] < _MIN_SMOOTH_MAXIMUM_WEIGHT:
+            if use[t, k] < _NEGLIGIBLE_GRADIENT_WEIGHT:
                 continue
             a, b = limits.capsule_pairs[k]
             _, on_a, on_b, towards_a = _nearest_points_of_segments(ends[t, a], ends[t, b])
-            g = scale_vector(-use[t, k] / ZERO_USE_CLEARANCE_MARGIN_M, towards_a)
+            g = scale_vector(-use[t, k] / CLEARANCE_USE_RANGE_M, towards_a)
             for capsule, share, sign in ((a, on_a, 1.0), (b, on_b, -1.0)):
                 row = limits.capsule_links[capsule]
                 if row >= 0:
                     start, along = _start_and_direction(limits.capsule_ends[capsule])
                     point = plus(start, scale_vector(share, along))
-                    add_point_to_seed(motions[t, row], point, scale_vector(sign, g), seeds[row])
-        _pull_back_gradient_at_sample(table, qd, qdd, motions, t, gradient, buffers)
+                    add_point_to_adjoint(motions[t, row], point, scale_vector(sign, g), seeds[row])
+        _add_joint_gradients_at_sample(arm_table, qd, qdd, motions, t, gradient, buffers)
     return maxima
 
 
@@ -321,7 +321,7 @@ def _are_segments_surely_apart(first, second, distance):
     # Sufficient condition for two segments (2, 3): four times the square of the middles' distance.
     (a, along_a), (b, along_b) = _start_and_direction(first), _start_and_direction(second)
     between = minus(minus(plus(a, vector_at(first[1], 0)), b), vector_at(second[1], 0))
-    # (a + b + c)^2 <= 3 (a^2 + b^2 + c^2)
+    # (a + b + weights)^2 <= 3 (a^2 + b^2 + weights^2)
     squares = dot(along_a, along_a) + dot(along_b, along_b) + 4 * distance * distance
     return dot(between, between) > 3 * squares
 

@@ -1,7 +1,7 @@
 """Gradients of functions of a serial arm's link motions, by the adjoint recursion (T48, T49).
 
-A seed contains the derivatives of a scalar J by a link's motion ``[s, omega, alpha, p, R]`` in W
-(specific force to rotation matrix). The derivative by R is g of ``dJ = g . dtheta``.
+An adjoint (21,) contains the derivatives of a scalar J by a link's motion in W, which is
+``[s, omega, alpha, p, R]``. That by R is the vector g of dJ = g . dtheta, for rotations dtheta.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from drake_teleop.load.regressor import wrench_of_load
 from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, SENSOR_MOTION_SIZE
 
 #: Size of a link's seed: derivatives by s, omega, alpha, p, theta, and v, w of virtual power.
-ADJOINT_SEED_SIZE = 21
-_S_IN_SEED, _OMEGA_IN_SEED, _ALPHA_IN_SEED, _P_IN_SEED, _THETA_IN_SEED = 0, 3, 6, 9, 12
-_VIRTUAL_V_IN_SEED, _VIRTUAL_W_IN_SEED = 15, 18
+ADJOINT_SIZE = 21
+_S_INDEX, _OMEGA_INDEX, _ALPHA_INDEX, _P_INDEX, _THETA_INDEX = 0, 3, 6, 9, 12
+_VIRTUAL_V_INDEX, _VIRTUAL_W_INDEX = 15, 18
 
 
 @njit(cache=True)
@@ -42,25 +42,25 @@ def rotate_to_link(motion, vector_W):
 
 
 @njit(cache=True)
-def add_vector_to_seed(motion, offset, gradient, seed):
+def add_vector_to_adjoint(motion, offset, gradient, seed):
     """Add a `gradient` by s, omega or alpha (`offset` 0, 3, 6), in link frame, to the `seed`."""
     g = rotate_to_world(motion, gradient)
     add_vector_into(seed, offset, g)
-    add_vector_into(seed, _THETA_IN_SEED, cross(g, vector_at(motion, offset)))
+    add_vector_into(seed, _THETA_INDEX, cross(g, vector_at(motion, offset)))
 
 
 @njit(cache=True)
-def add_point_to_seed(motion, point, gradient, seed):
+def add_point_to_adjoint(motion, point, gradient, seed):
     """Add a `gradient` in W, by the position of a link-fixed point (3,), to the link's `seed`."""
-    add_vector_into(seed, _P_IN_SEED, gradient)
-    add_vector_into(seed, _THETA_IN_SEED, cross(rotate_to_world(motion, point), gradient))
+    add_vector_into(seed, _P_INDEX, gradient)
+    add_vector_into(seed, _THETA_INDEX, cross(rotate_to_world(motion, point), gradient))
 
 
 @njit(cache=True)
-def add_wrench_to_seed(motion, phi, g_force, g_torque, seed):
-    """Add gradients by the wrench of load phi, in link frame, to `seed`; return s and omega."""
-    s = rotate_to_link(motion, vector_at(motion, _S_IN_SEED))
-    w = rotate_to_link(motion, vector_at(motion, _OMEGA_IN_SEED))
+def add_wrench_to_adjoint(motion, phi, g_force, g_torque, seed):
+    """Add dJ/dforce, dJ/dtorque of load phi to `seed`; return s, omega; all in link frame."""
+    s = rotate_to_link(motion, vector_at(motion, _S_INDEX))
+    w = rotate_to_link(motion, vector_at(motion, _OMEGA_INDEX))
     h, inertia = vector_at(phi, 1), symmetric_matrix_at(phi, 4)
     lever = cross(g_torque, h)
     gs = plus(scale_vector(phi[0], g_force), lever)
@@ -69,48 +69,48 @@ def add_wrench_to_seed(motion, phi, g_force, g_torque, seed):
     gw = plus(cross(cross(w, h), g_force), cross(h, cross(g_force, w)))
     gw = plus(gw, cross(apply_matrix(inertia, w), g_torque))
     gw = plus(gw, apply_matrix(inertia, cross(g_torque, w)))
-    add_vector_to_seed(motion, _S_IN_SEED, gs, seed)
-    add_vector_to_seed(motion, _OMEGA_IN_SEED, gw, seed)
-    add_vector_to_seed(motion, _ALPHA_IN_SEED, ga, seed)
+    add_vector_to_adjoint(motion, _S_INDEX, gs, seed)
+    add_vector_to_adjoint(motion, _OMEGA_INDEX, gw, seed)
+    add_vector_to_adjoint(motion, _ALPHA_INDEX, ga, seed)
     return s, w
 
 
 @njit(cache=True)
-def add_torque_to_seeds(table, motions, c, virtual_velocities, seeds):
-    """Add the gradients of c . tau to `seeds`; torques tau exclude rotor inertia and damping.
+def add_torque_to_adjoints(arm_table, motions, c, virtual_velocities, seeds):
+    """Add the gradients of sum(c * tau) to `seeds`; torques tau exclude rotor inertia and damping.
 
-    Write the links' velocities for joint velocities c (n,) into `virtual_velocities` (n+1, 6).
+    Write link velocities for joint velocities c (n,) into `virtual_velocities` (n+1, 6).
     """
     n = motions.shape[0] - 1
     v = w = p = (0.0, 0.0, 0.0)
     for row in range(n + 1):
-        motion, phi = motions[row], table[row, 12:22]
-        here = vector_at(motion, _P_IN_SEED)
+        motion, phi = motions[row], arm_table[row, 12:22]
+        here = vector_at(motion, _P_INDEX)
         v = plus(v, cross(w, minus(here, p)))
         p = here
         if row < n:
             along = scale_vector(c[row], (motion[14], motion[17], motion[20]))
-            if table[row, IS_PRISMATIC_COLUMN] != 0.0:
+            if arm_table[row, IS_PRISMATIC_COLUMN] != 0.0:
                 v = plus(v, along)
             else:
                 w = plus(w, along)
         virtual_velocities[row, 0], virtual_velocities[row, 1], virtual_velocities[row, 2] = v
         virtual_velocities[row, 3], virtual_velocities[row, 4], virtual_velocities[row, 5] = w
         v_L, w_L = rotate_to_link(motion, v), rotate_to_link(motion, w)
-        s, omega = add_wrench_to_seed(motion, phi, v_L, w_L, seeds[row])
-        alpha = rotate_to_link(motion, vector_at(motion, _ALPHA_IN_SEED))
+        s, omega = add_wrench_to_adjoint(motion, phi, v_L, w_L, seeds[row])
+        alpha = rotate_to_link(motion, vector_at(motion, _ALPHA_INDEX))
         force, torque = wrench_of_load(s, omega, alpha, phi)
         F, N = rotate_to_world(motion, force), rotate_to_world(motion, torque)
-        add_vector_into(seeds[row], _VIRTUAL_V_IN_SEED, F)
-        add_vector_into(seeds[row], _VIRTUAL_W_IN_SEED, N)
-        add_vector_into(seeds[row], _THETA_IN_SEED, plus(cross(F, v), cross(N, w)))
+        add_vector_into(seeds[row], _VIRTUAL_V_INDEX, F)
+        add_vector_into(seeds[row], _VIRTUAL_W_INDEX, N)
+        add_vector_into(seeds[row], _THETA_INDEX, plus(cross(F, v), cross(N, w)))
 
 
 @njit(cache=True)
-def pull_back_seeds(table, motions, qd, qdd, c, virtual_velocities, seeds, g_q, g_qd, g_qdd):
+def pull_back_adjoints(arm_table, motions, qd, qdd, c, virtual_velocities, seeds, g_q, g_qd, g_qdd):
     """Add the gradients by q, qd, qdd to `g_q`, `g_qd`, `g_qdd` (n,), from the seeds of all links.
 
-    `c` and `virtual_velocities` are those of `add_torque_to_seeds`, or zeros.
+    `c` and `virtual_velocities` are those of `add_torque_to_adjoints`, or zeros.
     """
     n = motions.shape[0] - 1
     gs = gw = ga = gp = gt = gv = go = (0.0, 0.0, 0.0)
@@ -118,13 +118,13 @@ def pull_back_seeds(table, motions, qd, qdd, c, virtual_velocities, seeds, g_q, 
     for row in range(n, -1, -1):
         motion, seed = motions[row], seeds[row]
         inboard = motions[row - 1] if row > 0 else still
-        w, a = vector_at(inboard, _OMEGA_IN_SEED), vector_at(inboard, _ALPHA_IN_SEED)
-        gs, gw = plus(gs, vector_at(seed, _S_IN_SEED)), plus(gw, vector_at(seed, _OMEGA_IN_SEED))
-        ga, gp = plus(ga, vector_at(seed, _ALPHA_IN_SEED)), plus(gp, vector_at(seed, _P_IN_SEED))
-        gt = plus(gt, vector_at(seed, _THETA_IN_SEED))
-        gv = plus(gv, vector_at(seed, _VIRTUAL_V_IN_SEED))
-        go = plus(go, vector_at(seed, _VIRTUAL_W_IN_SEED))
-        z, slides = (motion[14], motion[17], motion[20]), table[row, IS_PRISMATIC_COLUMN] != 0.0
+        w, a = vector_at(inboard, _OMEGA_INDEX), vector_at(inboard, _ALPHA_INDEX)
+        gs, gw = plus(gs, vector_at(seed, _S_INDEX)), plus(gw, vector_at(seed, _OMEGA_INDEX))
+        ga, gp = plus(ga, vector_at(seed, _ALPHA_INDEX)), plus(gp, vector_at(seed, _P_INDEX))
+        gt = plus(gt, vector_at(seed, _THETA_INDEX))
+        gv = plus(gv, vector_at(seed, _VIRTUAL_V_INDEX))
+        go = plus(go, vector_at(seed, _VIRTUAL_W_INDEX))
+        z, slides = (motion[14], motion[17], motion[20]), arm_table[row, IS_PRISMATIC_COLUMN] != 0.0
         if row < n and slides:
             gz = plus(scale_vector(qdd[row], gs), scale_vector(2.0 * qd[row], cross(gs, w)))
             gz = plus(gz, scale_vector(c[row], gv))
@@ -146,7 +146,7 @@ def pull_back_seeds(table, motions, qd, qdd, c, virtual_velocities, seeds, g_q, 
         if row < n and slides:
             g_q[row] += dot(z, gr)
         if row > 0:
-            r = minus(vector_at(motion, _P_IN_SEED), vector_at(inboard, _P_IN_SEED))
+            r = minus(vector_at(motion, _P_INDEX), vector_at(inboard, _P_INDEX))
             gw = plus(gw, plus(cross(cross(w, r), gs), cross(r, turned)))
             ga = plus(ga, cross(r, gs))
             go = plus(go, cross(r, gv))

@@ -44,16 +44,16 @@ def write_motion_replay(path: Path, excitation: Excitation) -> None:
         ],
         notes=("Line: path of the sensor, from rest to rest.",),
         clock_label="of the motion",
-        curves_label="force at the sensor, 0 to {top} N",
+        curves_label="colour: force at the sensor, 0 to {top} N",
     )
 
     def make_scene(meshcat: Meshcat) -> replay_file.ShowFrame:
         bodies = np.array([X_WB.translation() for X_WB in poses[0][0].values()])
         _add_table_and_sensor_path(meshcat, path_S, bodies)
-        _AddLinkShapesAndBones(meshcat, robot, context)
+        _AddLinkShapesAndLines(meshcat, robot, context)
 
-        def show(replay_time: float, frame: int) -> None:
-            for body, X_WB in poses[frame][0].items():
+        def show(replay_time: float, picture_index: int) -> None:
+            for body, X_WB in poses[picture_index][0].items():
                 meshcat.SetTransform(f"/arm/{int(body)}", X_WB, replay_time)
 
         return show
@@ -73,7 +73,7 @@ def _set_posture_and_get_poses_W(
     return poses, robot.scene.sensor_frame.CalcPoseInWorld(context)
 
 
-def _AddLinkShapesAndBones(meshcat: Meshcat, robot: Robot, context: Context) -> None:
+def _AddLinkShapesAndLines(meshcat: Meshcat, robot: Robot, context: Context) -> None:
     plant, inspector = robot.scene.plant, robot.scene.scene_graph.model_inspector()
     for k in range(1, plant.num_bodies()):
         body = plant.get_body(BodyIndex(k))

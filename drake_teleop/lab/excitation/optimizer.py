@@ -23,7 +23,7 @@ Bounds = list[tuple[float | None, float | None]]
 """Lower and upper bound of each unknown; None: unbounded."""
 
 _SAMPLES_PER_PERIOD_OF_TOP_HARMONIC = 24
-_JOINT_LIMIT_SHARE_OF_RANDOM_MOTION = 0.35  # of speed and acceleration limits
+_RANDOM_MOTION_SHARE_OF_JOINT_LIMITS = 0.35  # of speed and acceleration limits
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +44,9 @@ class Evaluation:
 
 
 class DesignProblem:
-    """Trajectory optimisation in x = [q0, sine, cosine] of `FourierTrajectory.rest_to_rest`.
+    """Trajectory optimisation in x = [q0, sine, cosine], the Fourier coefficients of the joints.
 
-    `num_harmonics` of the Fourier series is at least 2.
+    `num_harmonics` is at least 2.
     """
 
     def __init__(
@@ -71,11 +71,11 @@ class DesignProblem:
         return FourierTrajectory.rest_to_rest(x[:n], sine, cosine, 1 / self._period_s)
 
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
-        """Return the unknowns of a random motion, about the home posture or any posture."""
+        """Return the unknowns of a random motion, about a random posture unless `near_home`."""
         bounds, harmonics = self._limits, self._num_harmonics
         rate = 2 * np.pi / self._period_s * np.sqrt(harmonics)
         size = np.minimum(bounds.velocity / rate, bounds.acceleration / rate**2)
-        amplitude = _JOINT_LIMIT_SHARE_OF_RANDOM_MOTION * np.minimum(size, bounds.q_half)
+        amplitude = _RANDOM_MOTION_SHARE_OF_JOINT_LIMITS * np.minimum(size, bounds.q_half)
         spread = np.tile(np.repeat(amplitude, harmonics - 1), 2)
         q0 = self._home + 0.1 * rng.standard_normal(len(size))
         if not near_home:
@@ -94,13 +94,13 @@ class DesignProblem:
         smooth, largest = self._write_joint_gradients(q_qd_qdd, g_V, limit_sharpness, g)
         return Evaluation(value, smooth, self._gradients_by_coefficients(), largest)
 
-    def _evaluate_motion(self, x: Array, slowdown: float = 1.0) -> Array:
+    def _evaluate_motion(self, x: Array, time_factor: float = 1.0) -> Array:
         # q, qd, qdd (3, T, n); also writes the motions of links and sensor.
         n = len(self._home)
         q_qd_qdd: Array = self._basis @ x[n:].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
         q_qd_qdd[0] += x[:n]
-        q_qd_qdd[1] /= slowdown
-        q_qd_qdd[2] /= slowdown**2
+        q_qd_qdd[1] /= time_factor
+        q_qd_qdd[2] /= time_factor**2
         self._motions = limits.link_motion_series(self._table, *q_qd_qdd)
         self._vectors = limits.sensor_motion_series(self._motions)
         return q_qd_qdd
@@ -133,7 +133,7 @@ class DesignProblem:
 
 #: Usable share of each limit; the time grid misses up to 0.9 % of a fifth harmonic's peak.
 USABLE_LIMIT_SHARE = 0.985
-_MAX_FEASIBLE_LIMIT_USE_ON_GRID = 0.9885
+_MAX_FEASIBLE_LIMIT_USE_AT_SAMPLES = 0.9885
 
 # Number of candidates in a batch, and number of them from which a descent starts.
 _START_BATCH_SIZE, _NUM_DESCENT_STARTS = 128, 8
@@ -145,7 +145,7 @@ _SLSQP_SETTINGS_BY_STAGE = ((12.0, 200.0, 80), (40.0, 400.0, 120))
 # SLSQP outside this factor of the best.
 _MAX_INFEASIBLE_EVALUATIONS, _MAX_CRITERION_RATIO_TO_BEST = 250, 1.08
 # A bounded descent is repeated while it improves the criterion by this factor.
-_MAX_CRITERION_RATIO_FOR_REPEAT = 0.995
+_MAX_CRITERION_RATIO_TO_REPEAT_DESCENT = 0.995
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ def minimise_criterion(
 ) -> list[FeasibleIterate]:
     """Minimise the criterion within the limits; return the improving feasible iterates in order.
 
-    `starts` is the number of descents. `seconds` of CPU time replace it; results then vary.
+    `starts` limits the number of descents; `seconds` limits CPU time instead, so results vary.
     """
     search = _DescentSearch(problem, starts, seconds, progress)
     with one_blas_thread(), suppress(_TimeOutError):
@@ -236,7 +236,7 @@ class _DescentSearch:
                 return
             x = self._run_slsqp(x, *stage)
         before = float("inf")
-        while is_bounded and self._best_of_start < _MAX_CRITERION_RATIO_FOR_REPEAT * before:
+        while is_bounded and self._best_of_start < _MAX_CRITERION_RATIO_TO_REPEAT_DESCENT * before:
             before = self._best_of_start
             x = self._run_slsqp(x, *_SLSQP_SETTINGS_BY_STAGE[-1])
 
@@ -276,7 +276,7 @@ class _DescentSearch:
             self._count_evaluation_and_check_time()
             self._last = self._problem.evaluate(x, criterion_sharpness, limit_sharpness)
             self._key = key
-            if self._last.largest_limit_use <= _MAX_FEASIBLE_LIMIT_USE_ON_GRID:
+            if self._last.largest_limit_use <= _MAX_FEASIBLE_LIMIT_USE_AT_SAMPLES:
                 self._record_iterate_if_improved(x)
             elif self._evaluations > _MAX_INFEASIBLE_EVALUATIONS and np.isinf(self._best_of_start):
                 raise _InfeasibleStartError

@@ -63,7 +63,7 @@ def predicted_covariance(
 ) -> Array:
     """Return the covariance (16, 16) of identified offsets and phi after s, omega, alpha (T, 3).
 
-    `step` is the sample period [s], `phi` the true load (10,).
+    `step` is the sample period [s], `phi` (10,) the true load.
     """
     rows = np.concatenate([np.tile(np.eye(6), (len(s), 1, 1)), regressor(s, omega, alpha)], axis=2)
     weighted = rows / noise.assumed_wrench_std[:, np.newaxis] ** 2

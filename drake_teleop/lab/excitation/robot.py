@@ -35,7 +35,7 @@ _USABLE_JOINT_LIMIT_SHARE = 0.8
 # Usable share of the sensor's weakest axis; a grasped object is farther out than the tool.
 _USABLE_SENSOR_FORCE_SHARE, _USABLE_SENSOR_TORQUE_SHARE = 0.9, 10.0 / 12.0
 # Heaviest expected load over the modelled one (a grasped object of 0.8 kg).
-_HEAVIEST_EXPECTED_OVER_MODELLED_LOAD = 1.3
+_HEAVIEST_TO_MODELLED_LOAD_RATIO = 1.3
 # Payload of unknown shape: centre of mass along z_S, radius of gyration [m].
 _ASSUMED_PAYLOAD_COM_ALONG_Z_S_M, _ASSUMED_PAYLOAD_GYRATION_RADIUS_M = 0.08, 0.05
 _DEFAULT_PAYLOAD_KG = 2.0
@@ -79,7 +79,7 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
 
     slave = NominalSlave(scenario.slave)
     own = scenario.slave.model != ""
-    reserve = (_HEAVIEST_EXPECTED_OVER_MODELLED_LOAD - 1) * slave.arm.phi_load
+    reserve = (_HEAVIEST_TO_MODELLED_LOAD_RATIO - 1) * slave.arm.phi_load
     scene = CollisionScene(parse_slave_and_surroundings, reserve, visuals_collide=not own)
     scene.arm, _ = fill_missing_joint_limits(scene.arm, str(scenario.slave.path))
     lower, upper = np.array(_WORKSPACE_BOX_CORNERS_W)
@@ -109,7 +109,7 @@ def RobotFromModel(
 ) -> Robot:
     """Return a serial arm from a model file; weld free bases, lock joints beyond the sensor.
 
-    `acceleration` limits [rad/s^2] replace the model's; `payload` [kg] includes the model's load.
+    `acceleration` limits [rad/s^2] replace the model's; `payload` [kg]: mass beyond the sensor.
     """
     missing: list[str] = []
 
@@ -123,7 +123,7 @@ def RobotFromModel(
     check_arm_lengths(arm, str(path))
     load = arm.phi_load
     if payload is None and load[0] > 0:
-        reserve = (_HEAVIEST_EXPECTED_OVER_MODELLED_LOAD - 1) * load
+        reserve = (_HEAVIEST_TO_MODELLED_LOAD_RATIO - 1) * load
     else:
         mass = _DEFAULT_PAYLOAD_KG if payload is None else payload
         if not _MIN_PAYLOAD_KG <= mass <= _MAX_PAYLOAD_KG:
@@ -131,7 +131,7 @@ def RobotFromModel(
             remedy = "give the mass beyond the sensor in kg"
             raise DrakeTeleopError(what, where="--payload", remedy=remedy)
         if payload is None:
-            assumptions.append(f"a load of {mass:g} kg (--payload)")
+            assumptions.append(f"the load has {mass:g} kg (--payload sets it)")
         if mass <= load[0]:
             what = f"is {mass:g} kg, but the model contains {load[0]:.3g} kg beyond the sensor"
             remedy = "give the total mass beyond the sensor, or remove the option"

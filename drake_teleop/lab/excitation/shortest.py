@@ -38,14 +38,14 @@ _MAX_PERIOD_S, _MAX_FREQUENCY_HZ = 20.0, 15.0
 _MAX_LOG_PERIOD_CHANGE_BY_SLSQP = 0.15
 # Largest number of rounds; number of successful rounds without progress; required progress factor.
 _MAX_DESIGN_ROUNDS, _MAX_ROUNDS_WITHOUT_PROGRESS, _MAX_PERIOD_RATIO_OF_PROGRESS = 20, 1, 0.99
-_ERROR_FACTOR_GROWTH_AFTER_MISS = 1.005  # after a round that missed the tolerance
+_TOLERANCE_TIGHTENING_FACTOR = 1.005  # after a round that missed the tolerance
 _MAX_INFEASIBLE_ROUNDS = 3  # before the search fails
 # Largest error over tolerance of a motion that later rounds vary; number of such starts.
 _MAX_ERROR_RATIO_OF_VARIED_MOTION, _NUM_VARIED_STARTS = 1.5, 4
 _SEED_INCREMENT_PER_ROUND = 2**33
 # Variation in later rounds: share of the coefficients, factor of the period.
 _MAX_COEFFICIENT_VARIATION, _MAX_PERIOD_VARIATION_FACTOR = 0.2, 1.3
-_TOLERANCE_SHARPNESS_FACTOR = 4.0  # ratio of the maxima's sharpnesses
+_TOLERANCE_TO_CRITERION_SHARPNESS_RATIO = 4.0  # ratio of the maxima's sharpnesses
 _INFORMATION_REGULARISATION = 1e-11  # of balanced information, which is singular without motion
 
 
@@ -66,7 +66,7 @@ def design_shortest_motion(
     starts: int = 24,
     progress: Callable[[float, float], None] = lambda done, best: None,
 ) -> ShortestMotion:
-    """Design and check the shortest motion that reaches a tolerance.
+    """Design and check the shortest motion that identifies the load within a tolerance.
 
     Raises:
         DrakeTeleopError: if no motion of at most 20 s reaches the tolerance.
@@ -108,7 +108,7 @@ def design_shortest_motion(
         last_factor, factor = factor, factor * (reached / modelled)
         # No decrease after a round that missed the tolerance, to avoid oscillation.
         if worst > 1.0 and k > 0:
-            factor = _ERROR_FACTOR_GROWTH_AFTER_MISS * np.maximum(factor, last_factor)
+            factor = _TOLERANCE_TIGHTENING_FACTOR * np.maximum(factor, last_factor)
     if best is not None:
         return best
     what = "no motion within the limits reaches the tolerance"
@@ -118,20 +118,20 @@ def design_shortest_motion(
     raise DrakeTeleopError(what, where=f"{robot.name}: {tolerance}", remedy=remedy)
 
 
-def sidak_factor(count: int) -> float:
-    """Return z: with 95 % probability `count` errors are all within z deviations (Sidak)."""
-    return float(ndtri(0.5 + 0.5 * PROBABILITY_ALL_WITHIN_TOLERANCE ** (1.0 / count)))
+def sidak_factor(num_errors: int) -> float:
+    """Return z: with 95 % probability `num_errors` errors are all within z deviations (Sidak)."""
+    return float(ndtri(0.5 + 0.5 * PROBABILITY_ALL_WITHIN_TOLERANCE ** (1.0 / num_errors)))
 
 
 class ShortestMotionProblem(optimizer.DesignProblem):
     """Optimisation of the period T in the unknowns x = [q0, sine, cosine, log T].
 
     Args:
-        errors: (k, 16) linear combinations of offsets and phi; their deviations must be below 1.
+        errors: (k, 16) combinations of offsets and phi, over tolerance; std must be below 1.
         around: unknowns of an earlier motion that candidates vary, if any.
 
     Attributes:
-        best: unknowns of the shortest period passed to `value`.
+        best: unknowns of the shortest motion so far.
     """
 
     def __init__(self, robot: Robot, harmonics: int, errors: Array, around: Array | None) -> None:
@@ -140,7 +140,7 @@ class ShortestMotionProblem(optimizer.DesignProblem):
         self._around, self._at, self.best = around, np.empty(0), around
         self._errors, self._least = errors, np.inf
         noise, phi = robot.sensor_noise, robot.limits.heaviest_phi
-        self._noise = white_noise_densities_over_wrench_noise(noise, phi)
+        self._noise = noise_density_relative_to_wrench_noise(noise, phi)
         self._roots = np.sqrt(noise.white_noise_densities[:6])
         self._gradients = np.empty((2 + len(limits.LIMIT_NAMES), *self._gradients.shape[1:]))
         self._period, self._shortest = 1.0, harmonics / _MAX_FREQUENCY_HZ
@@ -176,8 +176,8 @@ class ShortestMotionProblem(optimizer.DesignProblem):
         self._period = T = float(np.exp(log_period))
         q_qd_qdd, g = self._evaluate_motion(x[:-1], T), self._gradients
         g[0] = 0.0
-        sharpness = _TOLERANCE_SHARPNESS_FACTOR * criterion_sharpness
-        use, worst, g_V = self._tolerance_use_and_regressor_gradient(sharpness)
+        sharpness = _TOLERANCE_TO_CRITERION_SHARPNESS_RATIO * criterion_sharpness
+        use, worst, g_V = self._tolerance_uses_and_gradient(sharpness)
         smooth, largest = self._write_joint_gradients(q_qd_qdd, g_V, limit_sharpness, g[1:])
         by_log_period = -(g[:, 1] * q_qd_qdd[1] + 2.0 * g[:, 2] * q_qd_qdd[2]).sum(axis=(1, 2))
         # Longer periods have more samples; the objective is log T.
@@ -197,7 +197,7 @@ class ShortestMotionProblem(optimizer.DesignProblem):
         return self._period
 
     def deviations(self, motion: tuple[Array, Array, Array], period: float) -> Array:
-        """Return predicted deviations (k,) of `errors`, over tolerances, for white noise only."""
+        """Return standard deviation over tolerance (k,), predicted for white noise only."""
         rows = self._weighted_regressor_rows(*motion)
         return np.sqrt(self._tolerance_scaled_variances(rows, period)[0])
 
@@ -220,7 +220,7 @@ class ShortestMotionProblem(optimizer.DesignProblem):
         Bv = v @ B
         return np.einsum("ki,ki->k", v, Bv), v, Bv @ inverse
 
-    def _tolerance_use_and_regressor_gradient(self, sharpness: float) -> tuple[float, float, Array]:
+    def _tolerance_uses_and_gradient(self, sharpness: float) -> tuple[float, float, Array]:
         rows = self._weighted_regressor_rows(*self._vectors)
         variances, v, u = self._tolerance_scaled_variances(rows, self._period)
         logs = 0.5 * np.log(variances)
@@ -233,8 +233,8 @@ class ShortestMotionProblem(optimizer.DesignProblem):
         return 1.0 + 0.5 * smooth, 1.0 + 0.5 * float(logs.max()), np.ascontiguousarray(g_V)
 
 
-def white_noise_densities_over_wrench_noise(noise: prediction.SensorNoise, phi: Array) -> Array:
-    """Return the density (6, 6) of wrench and motion noise, relative to that of wrench noise."""
+def noise_density_relative_to_wrench_noise(noise: prediction.SensorNoise, phi: Array) -> Array:
+    """Return noise density (6, 6) of wrench plus motion, scaled to unit wrench noise."""
     density = np.diag(noise.white_noise_densities[:6])
     if noise.motion_error_filters is not None:
         at_So = np.eye(6)

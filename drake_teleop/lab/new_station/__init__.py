@@ -41,7 +41,8 @@ def new_command(
     """Write `station.yaml` and `start.png` into `folder`, run the station, return its summary.
 
     Args:
-        tool: model file of the tool; None: the bodies beyond the sensor, or a stand-in.
+        package_paths: folders for package:// paths in model files.
+        tool: model file of the tool; None: the bodies beyond the sensor, or a rod with a ball.
         sensor: preset of the wrist sensor; None: the default sensor.
     """
     scenario = folder / "station.yaml"

@@ -27,7 +27,6 @@ _EXTREME_POINT_SEARCH_DIRECTIONS = np.random.default_rng(0).normal(size=(250, 3)
 
 
 def draw_start_posture(plan: StationPlan, title: str) -> Figure:
-    """Draw the station in its start posture, shapes as convex hulls."""
     shapes, wall = plan.posture_shapes, plan.wall
     triangles, colours = _arm_triangles_and_colours(shapes)
     faces = _box_triangles(np.array(wall.position), np.array([*wall.size, _WALL_THICKNESS_M]))

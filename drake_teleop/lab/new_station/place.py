@@ -59,20 +59,20 @@ _CUBE_HALF_EDGES_M = (0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3)  # half edges of t
 # Numbers of solved postures, of good ones with a tested cube, and of tested cubes otherwise; of
 # postures whose shapes are checked if all solved ones overlap.
 _NUM_SOLVED_POSTURES, _NUM_BEST_STARTS, _MAX_TESTED_CUBES, _NUM_OVERLAP_CHECKS = 40, 12, 60, 500
-_MAX_POSTURE_SCORE_LOSS_FOR_LARGER_CUBE = 0.3  # largest disadvantage of a start with a larger cube
+_ACCEPTED_SCORE_LOSS_FOR_LARGER_CUBE = 0.3  # largest disadvantage of a start with a larger cube
 _TOOL_YAWS_DEG = (0.0, 90.0, -90.0, 180.0)  # tested rotations of the tool about z_W [deg]
-_MAX_POSITION_ERROR_OVER_DISPLACEMENT = 0.1  # position error over displacement, below six dof
+_MAX_POSITION_ERROR_TO_DISPLACEMENT_RATIO = 0.1  # position error over displacement, below six dof
 # Smallest distance to a limit over half the range, and largest torque at rest over its limit: the
 # identification before a run uses 80 % of both.
 _MIN_START_JOINT_MARGIN, MAX_HOLDING_TORQUE_USE = 0.22, 0.7
 MIN_LOAD_SHARE_HELD_BY_MOTORS = 0.05  #: Share of the load that weak motors must hold at rest.
 _SUFFICIENT_START_JOINT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
-_MAX_CORNER_JOINT_CHANGE = 2.0  # largest joint displacement to a corner of the cube [rad, m]
+_MAX_JOINT_CHANGE_IN_CUBE = 2.0  # largest joint displacement to a corner of the cube [rad, m]
 _SUFFICIENT_CUBE_HALF_EDGE_M = 0.15  # sufficient half edge of the cube [m]
 _LOWEST_POINTS_HEIGHT_TOLERANCE_M = 1e-4  # these points share the contact
 # Vertical extent of the space above and below the tool's lowest point that wall and motion need.
 _SPACE_ABOVE_TOOL_POINT_M, _SPACE_BELOW_TOOL_POINT_M = 0.015, 0.16
-_MAX_WALL_EDGE_OVER_REACH = 0.6  # largest edge of a wall, over the reach
+_MAX_WALL_EDGE_TO_REACH_RATIO = 0.6  # largest edge of a wall, over the reach
 # Cost of overlaps and of shapes below the base plane [1/m], of any overlap, of each smaller wall.
 _OVERLAP_COST_PER_M, _COST_OF_ANY_OVERLAP, _COST_OF_SMALLER_WALL = 30.0, 1.0, 0.1
 _COST_OF_TILTED_TOOL, MIN_COS_OF_TOOL_DOWN = 1.0, 0.9999  # the cosine of 0.8 degrees
@@ -87,7 +87,7 @@ class StartPlace(NamedTuple):
         q: (n,) joint positions at the start [rad, m].
         cube_half_m: half edge of the reachable cube around the start [m].
         joint_margin: smallest distance of a joint to its limit, over half the joint's range.
-        posture_score: score of the posture (`posture_scores`) minus the costs of overlaps and wall.
+        posture_score: result of `posture_scores` minus costs of overlaps and wall.
         wall_edge_m: edge of the wall that fits below the tool [m].
         moves_only_vertically: True if only motion up and down by `cube_half_m` is reachable.
     """
@@ -119,7 +119,7 @@ class StartPlace(NamedTuple):
 
 
 class TrialWalls(Environment):
-    """Floating walls, one of each size in `WALL_EDGES_M`, to be tried below the tool."""
+    """Free bodies, a wall of each size, that are placed below the tool to find overlaps."""
 
     @property
     def slip_speed(self) -> float:
@@ -156,7 +156,7 @@ def find_start_place(
         if not all(place.has_overlaps for place in found):
             break
     found.sort(key=lambda place: place.posture_score, reverse=True)
-    least_score = found[0].posture_score - _MAX_POSTURE_SCORE_LOSS_FOR_LARGER_CUBE if found else 0.0
+    least_score = found[0].posture_score - _ACCEPTED_SCORE_LOSS_FOR_LARGER_CUBE if found else 0.0
     good = [place for place in found if place.posture_score > least_score]
     best = None
     for places, vertical in ((good[:_NUM_BEST_STARTS], False), (found, False), (found, True)):
@@ -224,7 +224,7 @@ def _solve_starts(
 ) -> Iterator[StartPlace]:
     if has_six_dof:
         pairs = zip(postures.q, postures.p_WS, strict=True)
-        solved = [s for q, p_WS in pairs for s in _starts_at_rounded_position(arm, q, p_WS)]
+        solved = [s for q, p_WS in pairs for s in _starts_at_position_rounded_to_cm(arm, q, p_WS)]
     else:  # position and orientation are coupled
         solved = [s for k in range(len(postures.q)) for s in _starts_below_6_dof(arm, postures, k)]
     if not solved:
@@ -252,7 +252,7 @@ def _starts_below_6_dof(
         yield found, pose, False
 
 
-def _starts_at_rounded_position(
+def _starts_at_position_rounded_to_cm(
     arm: ArmModel, q: Array, position: Array
 ) -> Iterator[tuple[Array, Array, bool]]:
     # Joint positions near q, their pose, and whether `slave.position` specifies them.
@@ -293,7 +293,7 @@ def _with_largest_fitting_wall(
         else:
             cost -= distance
             overlaps |= distance < -MIN_OVERLAP_M
-    large = sum(edge > _MAX_WALL_EDGE_OVER_REACH * region.reach for edge in WALL_EDGES_M[:-1])
+    large = sum(edge > _MAX_WALL_EDGE_TO_REACH_RATIO * region.reach for edge in WALL_EDGES_M[:-1])
     free = (k for k, depth in enumerate(depths.values()) if k >= large and depth == 0.0)
     rank = next(free, len(walls) - 1)
     cost += depths[walls[rank].index()]
@@ -345,22 +345,22 @@ def _with_reachable_cube(
         signs = signs[[2, 5]]
     largest = 0.0
     for half in _CUBE_HALF_EDGES_M:
-        if not all(_can_reach_corner(arm, place, half * each, has_six_dof) for each in signs):
+        if not all(_can_reach_cube_corner(arm, place, half * each, has_six_dof) for each in signs):
             break
         largest = half
     room = place.joint_margin if largest else 0.0
     return place._replace(cube_half_m=largest, joint_margin=room, moves_only_vertically=vertical)
 
 
-def _can_reach_corner(
+def _can_reach_cube_corner(
     arm: ArmModel, place: StartPlace, displacement: Array, has_six_dof: bool
 ) -> bool:
     target = place.pose + np.append(np.zeros(4), displacement)
     q, status = find_posture(arm, target, place.q)
     if has_six_dof:
-        return status == IkStatus.OK and bool(np.abs(q - place.q).max() < _MAX_CORNER_JOINT_CHANGE)
+        return status == IkStatus.OK and bool(np.abs(q - place.q).max() < _MAX_JOINT_CHANGE_IN_CUBE)
     error = np.linalg.norm(arm.pose(q)[4:] - target[4:])
-    return bool(error < _MAX_POSITION_ERROR_OVER_DISPLACEMENT * np.linalg.norm(displacement))
+    return bool(error < _MAX_POSITION_ERROR_TO_DISPLACEMENT_RATIO * np.linalg.norm(displacement))
 
 
 _MIN_COSINE_TOOL_TO_AXIS = 0.75  # smallest cosine of the angle between tool and axis
@@ -380,9 +380,8 @@ def nearest_sensor_axis(direction: Array) -> str:
 def sensor_axis_along_tool(arm: ArmModel, p_SScm_S: Array) -> str:
     """Return the axis of S along the tool, with the sign away from the arm.
 
-    It is the axis nearest to `p_SScm_S` [m], the tool's centre of mass, else to the last joint's
-    axis. The sign is that of the displacement from a point P of the arm to this centre, or to So
-    if `p_SScm_S` is 0. P is the point of the last joint's axis that is nearest to the joint before.
+    It is nearest to the tool's centre of mass `p_SScm_S` [m]; if that is 0, to the last joint's
+    axis. Away means from the point of this axis that is nearest to the joint before.
     """
     R = arm.table[-2:, ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(2, 3, 3)
     p = arm.table[-2:, TRANSLATION_COLUMN : TRANSLATION_COLUMN + 3]
@@ -400,7 +399,7 @@ def opposite_axis(axis: str) -> str:
 def tool_frame_advice(
     model: Path, frame: str, axis: str, *, is_along_tool: bool = True, is_site: bool = False
 ) -> str:
-    """Return how to add a sensor frame with z along `axis`, as a text; "" for axis "z"."""
+    """Return a text on how to add a frame with z along `axis` of sensor frame or MJCF site."""
     if axis == "z":
         return ""
     R_SA, name = R_SA_BY_AXIS[axis], f"{frame}_z_to_tool"

@@ -28,7 +28,7 @@ _STAND_IN_TOOL_MASSES_KG = (1.0, 0.5, 0.2, 0.1, 0.05)
 _MIN_TOOL_MASS_KG, _MIN_TOOL_LENGTH_M = 1e-6, 0.03  # of a tool in the model
 _STAND_IN_COM_M, _STAND_IN_LENGTH_M, _STAND_IN_BALL_RADIUS_M = 0.05, 0.1, 0.012
 _STAND_IN_FREE_LENGTH_M = 0.05
-_STAND_IN_FIRST_4_OF_PHI = _STAND_IN_TOOL_MASSES_KG[0] * np.array([1.0, 0.0, 0.0, _STAND_IN_COM_M])
+_STAND_IN_MASS_AND_MOMENT = _STAND_IN_TOOL_MASSES_KG[0] * np.array([1.0, 0.0, 0.0, _STAND_IN_COM_M])
 _SUFFICIENT_POSTURE_SCORE = 1.5  # of a start, at which no further substitute axis is tried
 _MIN_SLAVE_SWING_M, _MAX_SLAVE_SWING_M = 0.01, 0.04  # amplitude of the slave
 _DISPLAYABLE_CONTACT_FORCE_N = 30.0  # in addition to 1.5 times the weight
@@ -87,7 +87,7 @@ def plan_station(
         tool=stand_in if tool is None else Tool(model=str(tool)),
     )
     shapes = PostureShapes(slave, start.TrialWalls(), sticks=True)
-    load = shapes.arm.phi_load[:4] - (_STAND_IN_FIRST_4_OF_PHI if tool is None else 0.0)
+    load = shapes.arm.phi_load[:4] - (_STAND_IN_MASS_AND_MOMENT if tool is None else 0.0)
     has_load, own_tool = load[0] > _MIN_TOOL_MASS_KG, False
     p_SScm_S = load[1:] / load[0] if has_load else np.zeros(3)
     tool_axis = start.sensor_axis_along_tool(shapes.arm, p_SScm_S)
@@ -100,11 +100,11 @@ def plan_station(
     is_along_tool = axis == tool_axis or on_sensor is not None
     is_site = f"{FRAME_REPLACES_SITE_TEXT} {sensor_frame}" in shapes.assumptions
     share = 1.0 if own_tool else start.MIN_LOAD_SHARE_HELD_BY_MOTORS if tool is None else 0.0
-    model, weak_joints, texts = _without_weak_torque_limits(shapes.arm, place.q, share)
+    model, weak_joints, texts = _with_infinite_limits_for_weak_joints(shapes.arm, place.q, share)
     if axis != tool_axis:
         posture = "posture" if on_sensor is None else "posture without overlaps"
         what = f"no {posture} was found in which {tool_axis}_S, away from the arm, points down"
-        texts.append(f"{axis}_S downwards at the start, as {what}")
+        texts.append(f"{axis}_S points down at the start, because {what}")
     if on_sensor is not None:
         on_sensor.mass = _largest_holdable_tool_mass_kg(model, place.q)
     mass = float(model.phi_load[0]) if on_sensor is None else on_sensor.mass
@@ -121,7 +121,7 @@ def plan_station(
     direction = "down" if cosine > start.MIN_COS_OF_TOOL_DOWN else tilt
     swing = min(_MAX_SLAVE_SWING_M, place.cube_half_m / 2.0, room * translation_scale / 2.0)
     swing = min(swing, max(lowest[2] - plane, _MIN_SLAVE_SWING_M) / 2.0)
-    swing *= min(1.0, _MAX_JOINT_SPEED_USE / _swing_speed_over_joint_limit(model, place, swing))
+    swing *= min(1.0, _MAX_JOINT_SPEED_USE / _swing_to_joint_speed_ratio(model, place, swing))
     swing = _floor_to_two_significant_digits(swing)
     wall_position = lowest - [0.0, 0.0, 1.5 * swing]
     return StationPlan(
@@ -194,8 +194,8 @@ def _has_tool_beyond_sensor_link(shapes: PostureShapes, axis: str) -> bool:
 def find_base_plane_height(shapes: PostureShapes) -> float:
     """Return the height z_W of the base plane [m]: the lowest point of shapes fixed to the world.
 
-    Without such shapes it is 0, or the first joint's height if that is lower. Below a hanging arm
-    it is 0, or the sensor's lowest height in random postures if that is lower.
+    Without such shapes it is 0, or the first joint's height if lower. Below a hanging arm it is 0,
+    or the sensor's lowest height in random postures if lower.
     """
     heights = shapes.points_on_bodies_W(shapes.anchored_slave_bodies())[:, 2]
     is_known = len(heights) > 0 and not shapes.has_sticks
@@ -218,7 +218,7 @@ def _stand_in_tool_length_m(shapes: PostureShapes, axis: str) -> float:
     return max(_STAND_IN_LENGTH_M, float(np.ceil(100.0 * (end + _STAND_IN_FREE_LENGTH_M)) / 100.0))
 
 
-def _without_weak_torque_limits(
+def _with_infinite_limits_for_weak_joints(
     arm: ArmModel, q: Array, load_share: float
 ) -> tuple[ArmModel, tuple[str, ...], list[str]]:
     """Return the arm with infinite torque limits for weak joints, their names, and one text each.
@@ -244,7 +244,7 @@ def _largest_holdable_tool_mass_kg(arm: ArmModel, q: Array) -> float:
     return mass
 
 
-def _swing_speed_over_joint_limit(arm: ArmModel, place: start.StartPlace, swing_m: float) -> float:
+def _swing_to_joint_speed_ratio(arm: ArmModel, place: start.StartPlace, swing_m: float) -> float:
     above = place.pose.copy()
     above[6] += swing_m
     displacement = np.abs(find_posture(arm, above, place.q)[0] - place.q)

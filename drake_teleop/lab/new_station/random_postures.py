@@ -32,7 +32,7 @@ _MIN_TOOL_END_HEIGHT_M = 0.05  # height of the tool's end above the base plane, 
 _HALF_ANGLE_OF_SIDE_RAD, _NUM_EXAMINED_SIDES, _FRONT_POSTURE_COUNT_FACTOR = np.arccos(0.9), 24, 2.0
 _MIN_JOINT_ORIGIN_HEIGHT_M = 0.03  # height of joint origins above the base plane
 _MAX_RELATIVE_ZERO_SINGULAR_VALUE = 1e-9  # singular values that are 0, over the largest
-_MAX_NEUTRAL_ELBOW_OFFSET_OVER_REACH = 0.03  # smaller offsets have no direction
+_NEUTRAL_ELBOW_OFFSET_TO_REACH_RATIO = 0.03  # smaller offsets have no direction
 _SUFFICIENT_JOINT_MARGIN, _SUFFICIENT_SINGULAR_VALUE, _SUFFICIENT_ELBOW_UP_SHARE = 0.3, 0.05, 0.7
 
 
@@ -120,8 +120,8 @@ def select_suitable_postures(
 ) -> tuple[Postures, StartRegion]:
     """Return postures with the tool downwards, in reach and above the base plane, and their region.
 
-    They are in one direction from the first joint, that with most postures. `plane` is the height
-    z_W of the base plane [m].
+    Only the horizontal direction from the first joint with most postures remains. `plane` is the
+    height z_W of the base plane [m].
     """
     first = postures.origins[:, 0].mean(axis=0)
     from_first = postures.p_WS - first
@@ -218,4 +218,4 @@ def upward_share_of_elbow_offset(postures: Postures, reach: float) -> Array:
     rows, farthest = np.arange(len(sizes)), sizes.argmax(axis=1)
     size = sizes[rows, farthest]
     up: Array = offsets[rows, farthest, 2] / np.maximum(size, 1e-9)
-    return np.where(size > _MAX_NEUTRAL_ELBOW_OFFSET_OVER_REACH * reach, up, 1.0)
+    return np.where(size > _NEUTRAL_ELBOW_OFFSET_TO_REACH_RATIO * reach, up, 1.0)

@@ -27,13 +27,13 @@ from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 NamedValues = dict[str, Any]
 
-SIGMAS = (1.0, 0.5, 0.0)
-_CONTACT_THRESHOLD_OVER_FREE_PEAK_FORCE = 1.5
+DISPLAYED_LOAD_SHARES = (1.0, 0.5, 0.0)
+_CONTACT_THRESHOLD_TO_FREE_PEAK_RATIO = 1.5
 
 
 @dataclass(frozen=True, eq=False)
 class MotionRun:
-    """Simulated movement, with the scaled wrench for each of `SIGMAS`."""
+    """Simulated movement, with wrenches for displayed load shares (sigma) of 1, 0.5 and 0."""
 
     scenario: Scenario
     result: SimulationResult
@@ -66,7 +66,7 @@ class RunsWithAndWithoutContact:
 
     @property
     def response_span_s(self) -> tuple[float, float]:
-        """Times [s] of first contact and of settled filters after the last contact, or inf."""
+        """Times [s] of first contact and settled filters after the last; (inf, inf): no contact."""
         times = self.touched.result.t[self.in_contact]
         return (times[0], times[-1] + FILTER_SETTLING_S) if len(times) else (np.inf, np.inf)
 
@@ -74,18 +74,18 @@ class RunsWithAndWithoutContact:
     def threshold_N(self) -> float:
         """Force threshold of the contact detection [N]."""
         free_force = self.free.scaled_wrenches[0.0][:, :3]
-        return _CONTACT_THRESHOLD_OVER_FREE_PEAK_FORCE * _largest_norm(free_force)
+        return _CONTACT_THRESHOLD_TO_FREE_PEAK_RATIO * _largest_norm(free_force)
 
 
 def simulate_motion(scenario: Scenario, estimate: Array, progress: UpdateProgress) -> MotionRun:
-    """Simulate a movement and scale its wrench, for each share in `SIGMAS` of the load's."""
+    """Simulate a movement; scale its wrench for displayed load shares of 1, 0.5 and 0."""
     station = MakeTeleopStation(scenario, load_estimate=estimate)
     result = simulate(station, scenario.simulation, progress=progress)
     wrench, s, omega, alpha = sensor_samples(result)
     parts = wrench, estimate[:6], s, omega, alpha, estimate[6:], np.zeros(10)  # no object
     scaled = {
         sigma: scaled_wrench(*parts, sigma_gripper=sigma, sigma_object=sigma, gamma=1.0)
-        for sigma in SIGMAS
+        for sigma in DISPLAYED_LOAD_SHARES
     }
     return MotionRun(scenario, result, scaled)
 
@@ -146,8 +146,8 @@ def wrench_errors_of_ideal_run(run: IdealSensorRun) -> NamedValues:
 
 
 def peaks_and_residuals_of_free_run(run: MotionRun, component: int, unit: str) -> NamedValues:
-    """Return peak, RMS ratio and residuals of a wrench component by name, as in Fig. 6 and 7."""
-    raw, half, rest = (run.scaled_wrenches[sigma][:, component] for sigma in SIGMAS)
+    """Return peak, rms at sigma 0.5 over 1, and residuals (sigma 0) of one wrench component."""
+    raw, half, rest = (run.scaled_wrenches[sigma][:, component] for sigma in DISPLAYED_LOAD_SHARES)
     vector = slice(0, 3) if component < 3 else slice(3, 6)
     scale = run.scenario.force_scaling.force_scale
     peak = float(np.abs(raw).max())
@@ -183,7 +183,7 @@ def detection_and_peaks_of_contact_run(run: RunsWithAndWithoutContact) -> NamedV
 
 
 def largest_raw_force_beyond_free_range(run: RunsWithAndWithoutContact) -> Array:
-    """Return by how much raw f_x, f_y, f_z, |f| leave their contact-free range in contact [N]."""
+    """Return the excess (4,) [N] of raw f_x, f_y, f_z, |f| over their contact-free range."""
     touched, free = (
         np.column_stack([force, np.linalg.norm(force, axis=1)])
         for force in (one.scaled_wrenches[1.0][:, :3] for one in (run.touched, run.free))
@@ -196,7 +196,7 @@ def largest_raw_force_beyond_free_range(run: RunsWithAndWithoutContact) -> Array
 
 
 def time_of_largest_raw_force_after_contact(run: RunsWithAndWithoutContact) -> float | None:
-    """Return the time [s] of the largest raw force after `response_span_s`, or None."""
+    """Return the time [s] of the largest raw force after the last contact's response, or None."""
     t, (_, end) = run.touched.result.t, run.response_span_s
     force = np.linalg.norm(run.touched.scaled_wrenches[1.0][t > end, :3], axis=1)
     return float(t[t > end][np.argmax(force)]) if len(force) else None
@@ -225,7 +225,7 @@ def errors_of_identification(load: LoadIdentification, scenario: Scenario) -> Na
 
 
 def true_offsets_and_phi(scenario: Scenario) -> Array:
-    """Return (16,) the true sensor offsets, then phi, of Eq. (7)."""
+    """Return the true sensor offsets, then phi, (16,), of Eq. (7)."""
     return np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
 
 

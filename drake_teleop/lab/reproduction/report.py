@@ -90,13 +90,13 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
                        s["free_force.peak_raw_N"], "N", 90, 115),
         _compare_range("set", "Fig. 6: peak force at the master, σ = 1", "about 5.7 N",
                        s["free_force.peak_raw_master_N"], "N", 90 / 17.5, 115 / 17.5),
-        _compare_range("set", "Fig. 6: σ = 0.5 over σ = 1, rms", "half",
+        _compare_range("set", "Fig. 6: rms force, σ = 0.5 / σ = 1", "half",
                        s["free_force.half_ratio"], "", 0.48, 0.52),
         _compare_range("found", "Fig. 6: largest residual force, σ = 0", "never above 5 N",
                        s["free_force.residual_max_N"], "N", 0, 5),
         _row_without_verdict("set", "Fig. 7: peak torque at the slave, σ = 1", "in the figure only",
                       s["free_torque.peak_raw_Nm"], "N m"),
-        _compare_range("set", "Fig. 7: σ = 0.5 over σ = 1, rms", "half",
+        _compare_range("set", "Fig. 7: rms torque, σ = 0.5 / σ = 1", "half",
                        s["free_torque.half_ratio"], "", 0.48, 0.52),
         _row_without_verdict("found", "Fig. 7: largest residual torque, σ = 0", "“very low”",
                       s["free_torque.residual_max_Nm"], "N m"),
@@ -106,23 +106,22 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
                        s["ideal.residual_max_Nm"], "N m", 0, 1e-9),
         _compare_range("set", "Fig. 8: time of contact", "about 220 ms",
                        1e3 * s["contact.true_s"], "ms", 205, 235),
-        _compare_range("found", "Fig. 8: detection delay in the contact force", "“clearly spotted”",
+        _compare_range("found", "Fig. 8: delay from contact to detection", "“clearly spotted”",
                        delay_ms, "ms", 0, 10),
-        _compare_yes_no("Fig. 8: a threshold on the raw force detects contact", "“less obvious”",
+        _compare_yes_no("Fig. 8: raw force exceeds its free range", "“less obvious”",
                         s["contact.raw_detectable"], False),
-        _compare_yes_no("Fig. 8: false alarm at about 600 ms", "no contact there",
+        _compare_yes_no("Fig. 8: contact force false alarm, 600 ms", "no contact there",
                         s["contact.false_alarm_0_6_s"], False),
-        _compare_range("found", "Fig. 8: contact peak over inertial peak", "“significantly lower”",
+        _compare_range("found", "Fig. 8: contact / inertial peak force", "“significantly lower”",
                        share, "", 0, 0.7),
         _compare_range("found", "Mass, error of the estimate", _NOT_REPORTED,
                        s["identification.mass_error_percent"], "%", 0, 0.2),
-        _compare_range("found", "Centre of mass, error of the estimate", _NOT_REPORTED,
+        _compare_range("found", "Centre of mass, distance to estimate", _NOT_REPORTED,
                        s["identification.com_error_mm"], "mm", 0, 0.5),
     ]  # fmt: skip
 
 
-def describe_unaccepted(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return a text for each reproduced value that is outside its accepted range."""
+def describe_values_outside_ranges(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
     return [
         f"{row.quantity}: {row.reproduced_value} (accepted: {row.accepted_range}): {row.verdict}"
         for row in compare_with_paper(values_by_full_name(summary))
@@ -194,7 +193,7 @@ def write_report(
     summary: Mapping[str, Any],
     parameters: Sequence[ParameterRow],
 ) -> None:
-    """Write the figures (fig6 to fig8), and report.html with them and a link to replay.html."""
+    """Write the figures (fig6 to fig8), and report.html with them and the given results."""
     names = ("drake_teleop", "drake", "numpy", "scipy", "numba")
     versions = {"Python": platform.python_version()} | {n: metadata.version(n) for n in names}
     write_report_page_and_pictures(
@@ -299,8 +298,8 @@ def contact_figure(run: experiments.RunsWithAndWithoutContact, detected_s: float
             rows[1].axhline(level, color=VERMILION, linewidth=0.8, linestyle=":")
         peak, contact_peak = (f"peak {_format_number(np.abs(trace).max())} N" for trace in traces)
         _write_note_above_axes(rows[0], peak)
-        threshold = f"threshold {_format_number(run.threshold_N)} N"
-        _write_note_above_axes(rows[1], f"{contact_peak}   ·   {threshold}")
+        threshold = _format_number(run.threshold_N)
+        _write_note_above_axes(rows[1], f"{contact_peak}   ·   threshold {threshold} N")
         rows[0].set(ylim=_common_y_limits(traces), xlim=(time[0], time[-1]))
         rows[1].set_xlabel(f"t [{time_unit}]")
     return figure

@@ -28,13 +28,13 @@ MAX_RUNS = 10**6
 class Factor:
     """Scenario field that the study varies."""
 
-    field: str = plain("", "`block.field` of a scenario file")
-    values: list[float] = plain([], "numbers")
-    words: list[str] = plain([], "words, instead of numbers")
-    flags: list[bool] = plain([], "true or false, instead of numbers")
-    vectors: list[list[float]] = plain([], "vectors, instead of numbers")
-    low: float | None = plain(None, "start of a range, instead of a list")
-    high: float | None = plain(None, "end of the range")
+    field: str = plain("", "`block.field` of the scenario file that this factor varies")
+    values: list[float] = plain([], "numbers that the field takes")
+    words: list[str] = plain([], "words that the field takes, instead of `values`")
+    flags: list[bool] = plain([], "[false, true] for a flag, instead of `values`")
+    vectors: list[list[float]] = plain([], "vectors, instead of `values`")
+    low: float | None = plain(None, "lowest value of a range, instead of `values`")
+    high: float | None = plain(None, "highest value of the range")
     levels: int = quantity(3, "1", 2, 1000, "number of values from low to high (factorial)")
 
     def level_values(self) -> Sequence[FactorValue]:
@@ -44,7 +44,7 @@ class Factor:
         return list(map(float, self.values)) or self.words or self.flags or self.vectors
 
     def value_at_share(self, share: float) -> FactorValue:
-        """Return the value at a share (0 to 1) of `low` to `high`, or of the listed values."""
+        """Return low + share * (high - low), or the listed value at this share of the list."""
         if self.low is not None and self.high is not None:
             return self.low + share * (self.high - self.low)
         listed = self.level_values()
@@ -79,7 +79,7 @@ class Factor:
         listed = self.level_values()
         if repeated := [value for k, value in enumerate(listed) if value in listed[:k]]:
             remedy = "list each value once"
-            raise DrakeTeleopError(f"repeats the value {repeated[0]}", where=where, remedy=remedy)
+            raise DrakeTeleopError(f"lists {repeated[0]} twice", where=where, remedy=remedy)
 
 
 @settings
@@ -99,7 +99,7 @@ class Study:
         "all combinations of the values, scrambled Sobol points, or a search for the best point",
     )
     samples: int = quantity(
-        64, "1", 1, 2**20, "number of points of a Sobol (power of two) or adaptive design"
+        64, "1", 1, 2**20, "number of points of a Sobol design (a power of two) or adaptive design"
     )
     objective: str = plain("", "measure whose mean over the repeats an adaptive design minimises")
     batch: int = quantity(8, "1", 1, 2**10, "number of points in one batch of an adaptive design")
@@ -141,9 +141,9 @@ class Study:
         return self.samples
 
     def check_num_runs(self, where: str, yes: bool | Callable[[str], bool]) -> None:
-        """Raise DrakeTeleopError for too many runs, or without consent to runs that take days.
+        """Raise DrakeTeleopError for too many runs, or above 100,000 runs without consent.
 
-        `yes` is the consent, or a function from a question to the user's answer.
+        `yes` is the consent, or a function that asks the user a question.
         """
         runs = self.num_points() * self.repeats
         count = f"{runs:,} runs" if runs < 10**15 else f"10^{math.log10(runs):.1f} runs"
@@ -154,7 +154,7 @@ class Study:
             return
         if yes is False or not yes(f"{where}: {count}. Begin?"):
             remedy = "confirm them by --yes (in Python: yes=True)"
-            raise DrakeTeleopError(f"{count} require a confirmation", where=where, remedy=remedy)
+            raise DrakeTeleopError(f"{count} need your consent", where=where, remedy=remedy)
 
     def points(self) -> list[FactorValues]:
         """Return all points (field -> value), or the first points of an adaptive design."""

@@ -47,11 +47,10 @@ class FactorialModel:
     has_value: BooleanArray
 
     def comparison_weights(self, *factors: int) -> tuple[BooleanArray, BooleanArray, Array]:
-        """Return flags of comparable levels of `factors`, flags of used combinations, and weights.
+        """Return flags of comparable levels (or pairs) and of used combinations, and weights.
 
-        Comparable levels have points at all used combinations of the other factors' levels. With
-        two `factors` a level is a pair.
-        The weights (comparable levels, n) map values of points to means over used combinations.
+        Comparable levels have points at all used combinations of the other factors' levels. The
+        weights (comparable levels, n) average over these points.
         """
         others = [factor for factor in range(len(self.counts)) if factor not in factors]
         row, rows = self._index_level_combinations(factors)
@@ -104,7 +103,7 @@ class FactorialModel:
 
 
 def fill_missing_values(values: Array) -> Array:
-    """Replace nan in values (n, seeds) by the least-squares sum of point and seed effect."""
+    """Replace nan in values (n, seeds) by a least-squares point effect plus seed effect."""
     known = np.isfinite(values)
     if known.all():
         return values
@@ -127,7 +126,7 @@ def means_and_half_widths_over_seeds(table: Array) -> tuple[Array, Array]:
 
 
 def effect_half_widths_over_seeds(table: Array) -> Array:
-    """Return the half widths (n,) of the differences from the mean of n levels (n, seeds)."""
+    """Return half widths (n,) of each level minus the mean level, from values (n, seeds)."""
     # Seeds without some level are excluded: they would shift all other levels.
     return means_and_half_widths_over_seeds(table - table.mean(axis=0))[1]
 
@@ -146,7 +145,7 @@ class MainEffect:
         mean, half_width: (n,) mean over other factors and seeds, and its half width.
         effect, effect_half_width: (n,) difference from the mean of all levels, and its half width.
         missing_reasons: (n,) why a value is missing, else "".
-        num_used_combinations, num_unused_combinations: of the other factors' levels.
+        num_used_combinations, num_unused_combinations: combinations of the other factors.
         is_fitted: True if the values are from a `LevelModel`.
     """
 
@@ -257,7 +256,7 @@ class _MeasureEffectModel:
                 found = [*self.model.means(self.table, weights), effects[factor], halves[factor]]
                 figures[:, is_compared] = found
         runs = np.bincount(levels.index, self.runs, count).astype(np.int64)
-        reasons_and_counts = self._summarise_coverage(is_compared, levels.index, used, factor)
+        reasons_and_counts = self._reasons_and_counts(is_compared, levels.index, used, factor)
         return MainEffect(levels.names, runs, mean, half, effect, effect_half, *reasons_and_counts)
 
     def pair_means(self, first: int, second: int) -> PairMeans | None:
@@ -272,12 +271,12 @@ class _MeasureEffectModel:
         cell = a.index * shape[1] + b.index
         is_compared &= np.bincount(cell, self.runs, len(is_compared)) > 0
         mean[~is_compared] = np.nan
-        why, used, unused, fitted = self._summarise_coverage(is_compared, cell, over, first, second)
+        why, used, unused, fitted = self._reasons_and_counts(is_compared, cell, over, first, second)
         fields, names = (self.factors[first].field, self.factors[second].field), (a.names, b.names)
         reasons = np.array(why).reshape(shape)
         return PairMeans(fields, names, mean.reshape(shape), reasons, used, unused, fitted)
 
-    def _summarise_coverage(
+    def _reasons_and_counts(
         self, compared: BooleanArray, cell: NDArray[np.int64], used: BooleanArray, *factors: int
     ) -> tuple[list[str], int, int, bool]:
         # The last four fields of `MainEffect`; `used` flags combinations.
@@ -299,7 +298,7 @@ def values_by_seed(rows: pl.DataFrame, measure: str, by: str = "point") -> Array
 
 
 def pareto_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
-    """Return a row per point: means, half widths, flags; None without all `PARETO_MEASURES`."""
+    """Return means, half widths, "complete" and "front" flags by point, or None."""
     import polars as pl
 
     if not set(PARETO_MEASURES) <= set(study.measures) or rows.is_empty():

@@ -1,6 +1,6 @@
 """Effects from an unbalanced design by one regression with all factors (docs/studies.md).
 
-Intervals assume points that are as good as random (Owen 1997).
+Intervals assume that scrambled Sobol points are a random sample (Owen 1997).
 """
 
 from __future__ import annotations
@@ -62,9 +62,8 @@ class Levels:
         index: (n,) index in `names` of each point's level.
         names: labels of the levels with a point.
         within: (n,) position in the section of a range, -1/2 to 1/2; None for listed values.
-        centred_columns: (n, k) centred coordinates of the points: numbers, or indicators of all
-            values but one.
-        middle_columns: (levels, k) the same coordinates at the middle of each level.
+        centred_columns: (n, k) regressors with mean 0: numbers, or indicators of other values.
+        middle_columns: (levels, k) the same regressors at the middle of each level.
     """
 
     index: NDArray[np.int64]
@@ -102,9 +101,9 @@ class LevelModel:
     """Linear regression of a measure on the levels of all factors.
 
     Attributes:
-        codes: for each factor, the effect codes (levels, k) of its levels, columns of X.
-        products: columns of X with products of factors (i, j).
-        excluded_cells: by factors (i, j), flags (levels, levels); of (i, i) the diagonal counts.
+        codes: for each factor, the values (levels, k) of its k columns of X at its levels.
+        products: columns of X for the interaction of factors (i, j).
+        excluded_cells: (levels of i, levels of j) flags of unused cells by factors (i, j), i <= j.
         X: (n, p) design matrix; first column: the mean.
         pseudo_inverse: (p, n) pseudo-inverse of X.
     """
@@ -117,7 +116,7 @@ class LevelModel:
     pseudo_inverse: Array
 
     def comparison_weights(self, *factors: int) -> tuple[BooleanArray, BooleanArray, Array]:
-        """Return flags as in `FactorialModel`, and weights from coefficients to levels' means."""
+        """Return flags of comparable levels and used combinations, and weights of coefficients."""
         others = sorted(set(itertools.chain(*self.excluded_cells)) - set(factors))
         related = [*factors, *others]
         shape = [len(self.factors[factor].names) for factor in related]
@@ -209,8 +208,8 @@ def fit_level_model(
 ) -> LevelModel | None:
     """Return a regression model with as many terms as the points determine, or None.
 
-    `known` (n,) flags points with a value. With `by_chance` combinations without points are
-    missing by chance, not by failure.
+    `columns` contains the n values of each factor; `known` (n,) flags points with a value. Without
+    `by_chance`, combinations without points are excluded as failures.
     """
     found, known = None, np.ones(len(columns[0]), bool) if known is None else known
     for num_sections, products in _MODEL_FORMS_BY_PREFERENCE:
@@ -271,9 +270,9 @@ def _pair_products(a: Array, b: Array) -> Array:
     return np.einsum("ni,nj->nij", a, b).reshape(len(a), -1)
 
 
-def _effect_codes(count: int, present: NDArray[np.int64]) -> Array:
-    codes = np.zeros((count, len(present) - 1))
-    codes[present[:-1]], codes[present[-1]] = np.eye(len(present) - 1), -1.0
+def _effect_codes(num_levels: int, used: NDArray[np.int64]) -> Array:
+    codes = np.zeros((num_levels, len(used) - 1))
+    codes[used[:-1]], codes[used[-1]] = np.eye(len(used) - 1), -1.0
     return codes
 
 

@@ -57,7 +57,7 @@ def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
 
 
 def draw_main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figure:
-    factors, fitted, reasons = varied_factors(study), False, set[str]()
+    factors, is_fitted, reasons = varied_factors(study), False, set[str]()
     with plot_style():
         figure = Picture(figsize=(1.2 + 2.3 * len(factors), 0.8 + 1.6 * len(measures)))
         grid = figure.subplots(len(measures), len(factors), squeeze=False, sharey="row")
@@ -65,13 +65,13 @@ def draw_main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> 
             found = effects.main_effects(study, rows, measure)
             for axes, factor in zip(line, factors, strict=True):
                 _draw_level_means(axes, found[factor.field])
-                fitted |= found[factor.field].is_fitted
+                is_fitted |= found[factor.field].is_fitted
                 reasons |= set(found[factor.field].missing_reasons)
             words = textwrap.wrap(measure.replace("_", "_ "), 18)
             line[0].set_ylabel("\n".join(words).replace(" ", ""), fontsize=7)
         for axes, factor in zip(grid[-1], factors, strict=True):
             axes.set_xlabel(factor.field)
-        figure.suptitle(f"Main effects{_effects_caption(study, fitted)}", x=0.01, ha="left")
+        figure.suptitle(f"Main effects{_effects_caption(study, is_fitted)}", x=0.01, ha="left")
         _draw_hatch_legend(figure, reasons)
     return figure
 
@@ -148,7 +148,7 @@ def draw_interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure 
 
 
 def draw_pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
-    """Draw effort against task time and force overshoot; return None without complete points."""
+    """Draw the hand's effort over task time and over force overshoot; None without points."""
     points = pareto_table(study, rows)
     if points is None or not points["complete"].any():
         return None
@@ -182,9 +182,9 @@ def draw_pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
     return figure
 
 
-def _effects_caption(study: Study, fitted: bool) -> str:
-    if not fitted:
-        return _interval_caption(study, "of a level against the mean (dotted)")
+def _effects_caption(study: Study, is_fitted: bool) -> str:
+    if not is_fitted:
+        return _interval_caption(study, "of each level minus the mean (dotted)")
     words = f"; bars: {CONFIDENCE_LEVEL:.0%} intervals of all levels against the mean (dotted)"
     over = "one seed" if study.repeats == 1 else f"{study.repeats} seeds"
     return f"{words}, over the design and {over}"

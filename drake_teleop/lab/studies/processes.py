@@ -1,7 +1,7 @@
 """Execution of a study's runs by processes of this machine, Dask workers or a custom executor.
 
-If a run crashes its process, the runs of its chunk are repeated one by one; a run that crashes
-again gets an error text. With one job, a crash ends the study.
+After a crash the runs of the chunk are repeated singly; one that crashes again gets an error text.
+With one job, a crash ends the study.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from drake_teleop.lab.studies.store import Chunk, Store
 RunRows: TypeAlias = Callable[[Chunk], Chunk]
 RunChunks: TypeAlias = Callable[[RunRows, Sequence[Chunk]], Iterator[Chunk]]
 """Function that runs chunks in parallel and yields each one when it is finished."""
-PROCESS_ENDED_ERROR = "the run has ended its process"
+PROCESS_ENDED_ERROR_TEXT = "the run has ended its process"
 
 
 @contextmanager
 def open_executor(
     store: Store, jobs: int, cluster: str | None, executor: Executor | None
 ) -> Iterator[tuple[int, RunChunks]]:
-    """Start the processes; yield the number of parallel runs and a `RunChunks` function.
+    """Start `jobs` processes; yield the number of parallel runs and a function that runs chunks.
 
-    `cluster` is the address of a Dask scheduler, or "local"; `executor` remains open.
+    `cluster` is the address of a Dask scheduler, or "local"; a given `executor` is not shut down.
     """
     if executor is not None:
         if not isinstance(executor, Executor):
@@ -58,7 +58,7 @@ def _run_locally(run: RunRows, chunks: Sequence[Chunk], store: Store, jobs: int)
     # One mark may come from a killed session; two marks of one chunk indicate a crash.
     suspicious = 2
     while left:
-        marked = store.first_runs_of_chunks_started_at_least(suspicious)
+        marked = store.first_runs_of_chunks_by_min_starts(suspicious)
         for chunk in left:
             if chunk[0]["run"] in marked:
                 yield _run_rows_one_by_one(run, chunk, store)
@@ -70,7 +70,7 @@ def _run_locally(run: RunRows, chunks: Sequence[Chunk], store: Store, jobs: int)
                 yield found
         except BrokenExecutor as error:
             suspicious = 1
-            if not store.first_runs_of_chunks_started_at_least(suspicious):
+            if not store.first_runs_of_chunks_by_min_starts(suspicious):
                 what = f"processes ended before their first run ({error})"
                 remedy = "repeat with --jobs 1 to see the cause"
                 raise DrakeTeleopError(what, where="study", remedy=remedy) from error
@@ -106,7 +106,7 @@ def _run_rows_one_by_one(run: RunRows, chunk: Chunk, store: Store) -> Chunk:
             # With one job joblib would run it in this process.
             found += next(_joblib_pool(2)([_joblib_task(run, [row], store)]))
         except BrokenExecutor:
-            found.append(row | {"error": PROCESS_ENDED_ERROR})
+            found.append(row | {"error": PROCESS_ENDED_ERROR_TEXT})
     store.clear_start_count_of_chunk(chunk[0]["run"])
     return found
 
@@ -218,7 +218,7 @@ def _await_rows(future: Any, chunk: Chunk, run: RunRows, client: Any) -> Chunk:
         found: Chunk = future.result()
     except KilledWorker:
         if len(chunk) == 1:
-            return [chunk[0] | {"error": PROCESS_ENDED_ERROR}]
+            return [chunk[0] | {"error": PROCESS_ENDED_ERROR_TEXT}]
         alone = [(client.submit(run, [row], pure=False), [row]) for row in chunk]
         found = [row for part, rows in alone for row in _await_rows(part, rows, run, client)]
     return found

@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     import polars as pl
 
 RunFunction: TypeAlias = Callable[[FactorValues, int], dict[str, float]]
-"""Function from factor values and seed to the run's measures; `ONE_TIME_COST_KEY` is optional."""
+"""Function from factor values and seed to the run's measures; `SETUP_TIME_S_KEY` is optional."""
 
-ONE_TIME_COST_KEY = "seconds_once"
+SETUP_TIME_S_KEY = "seconds_once"
 """Name of the time [s] for work that most other runs do not repeat, e.g. load identification."""
 _RUN_TIME_S_KEY = "seconds"
 
@@ -55,8 +55,8 @@ def run_study(
 ) -> pl.DataFrame:
     """Run all runs that `out` does not contain yet; return the rows of all runs, sorted by run.
 
-    `inputs` is JSON data of the inputs besides `study`. `shard` "K/N" restricts runs and rows to
-    this shard; `merge` collects the rows of all shards and runs nothing.
+    `inputs` is JSON data of all else that determines results, to refuse an `out` of other inputs.
+    `shard` "K/N" restricts runs and rows to this shard; `merge` only collects all shards' rows.
     """
     import polars as pl
 
@@ -141,7 +141,7 @@ class StudyProgress:
         for row in rows:
             if _RUN_TIME_S_KEY in row:  # missing if the run ended its process
                 first = self._num_timed < _NUM_RUNS_FOR_TIME_ESTIMATE
-                self._recent.append(row[_RUN_TIME_S_KEY] - first * row.get(ONE_TIME_COST_KEY, 0.0))
+                self._recent.append(row[_RUN_TIME_S_KEY] - first * row.get(SETUP_TIME_S_KEY, 0.0))
                 self._num_timed += 1
         self._report_progress()
 

@@ -1,6 +1,6 @@
 """`drake-teleop scaling-study`: best force scales for the simulated operator.
 
-The merit of a point (sigma, gamma) is the mean over tasks of its criteria, relative to those of
+The merit of a point (sigma, gamma) is the mean over tasks of its criteria divided by those of
 sigma = gamma = 1; a bootstrap over seeds gives intervals (docs/scaling-study.md).
 """
 
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 
 CRITERIA = {"effort": "effort_Ns", "time": "task_time_s", "force": "contact_force_overshoot_N"}
 #: Selections of equally weighted criteria.
-CRITERIA_SETS = {"all": tuple(CRITERIA), **{name: (name,) for name in CRITERIA}}
+CRITERIA_BY_CHOICE = {"all": tuple(CRITERIA), **{name: (name,) for name in CRITERIA}}
 TASK_CRITERIA = dict.fromkeys(("reach", "touch", "press", "insert"), tuple(CRITERIA))
 """Criteria of each task; free reaching has no contact."""
 TASK_CRITERIA["reach"] = ("effort", "time")
-_ETA_STUDY_NAME = "scaling_object"
+_OBJECT_SHARE_STUDY_NAME = "scaling_object"
 _SIGMA_KEY, _GAMMA_KEY, _ETA_KEY = (f"force_scaling.{name}" for name in ("sigma", "gamma", "eta"))
 _NUM_BOOTSTRAP_DRAWS, _BOOTSTRAP_SEED = 2000, 0
 _MAX_FAILED_RUN_SHARE, _MIN_SHARE_OF_DRAWS_AS_BEST = 0.05, 0.05
@@ -65,15 +65,17 @@ def scaling_study_command(
     """
     files.make_folder(out)
     rows = {}
-    for name in (*(f"scaling_{task}" for task in TASK_CRITERIA), _ETA_STUDY_NAME):
+    for name in (*(f"scaling_{task}" for task in TASK_CRITERIA), _OBJECT_SHARE_STUDY_NAME):
         study_command(name, out / name, quiet=quiet, progress=progress, **options)
         rows[name] = Store(out / name / "runs.parquet").read()
     tables = {task: _criterion_tables(rows[f"scaling_{task}"], task) for task in TASK_CRITERIA}
-    ratings = {name: rate_scales(tables, criteria) for name, criteria in CRITERIA_SETS.items()}
+    ratings = {
+        name: judge_scales(tables, criteria) for name, criteria in CRITERIA_BY_CHOICE.items()
+    }
     summary = {
         "runs": sum(table.height for table in rows.values()),
         "choice": {selection: _find_best_scales(rating) for selection, rating in ratings.items()},
-        "eta": _summarise_measures_by_eta(rows[_ETA_STUDY_NAME]),
+        "eta": _summarise_measures_by_object_share(rows[_OBJECT_SHARE_STUDY_NAME]),
     }
     with files.output_folder(out, "answer.json"):
         files.write_table(out / "answer.csv", _merit_table(ratings))
@@ -85,10 +87,10 @@ def scaling_study_command(
     return summary
 
 
-def rate_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> ScaleRating:
+def judge_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> ScaleRating:
     """Return the rating of each sigma and gamma by these `criteria`.
 
-    `tables` [task][criterion or "success"] are arrays (sigmas, gammas, seeds).
+    `tables[task]` maps criterion names and "success" to arrays (sigmas, gammas, seeds).
     """
     # A task may have none of the selected criteria.
     counted = {task: [name for name in TASK_CRITERIA[task] if name in criteria] for task in tables}
@@ -184,7 +186,7 @@ def _merit_table(ratings: dict[str, ScaleRating]) -> pl.DataFrame:
     return pl.concat(map(pl.DataFrame, tables))
 
 
-def _summarise_measures_by_eta(rows: pl.DataFrame) -> list[dict[str, Any]]:
+def _summarise_measures_by_object_share(rows: pl.DataFrame) -> list[dict[str, Any]]:
     etas = sorted(rows[_ETA_KEY].unique().to_list())
     table: list[dict[str, Any]] = [{"eta": eta} for eta in etas]
     for measure in ("success", *CRITERIA.values(), "detection_time_s"):
@@ -246,7 +248,7 @@ def draw_best_scales(
                 dark = abs(scale(rating.merit[i, j]) - 0.5) > 0.3
                 axes.text(j, i, _merit_cell_text(rating, i, j), color="white" if dark else "black",
                           ha="center", va="center", fontsize=7.5)  # fmt: skip
-        bar = figure.colorbar(drawn, ax=grid, label="merit (1: that of sigma = gamma = 1)")
+        bar = figure.colorbar(drawn, ax=grid, label="merit (less: better; 1 at sigma = gamma = 1)")
         ticks = [tick for tick in (0.1, 0.2, 0.5, 1, 2, 5, 10) if ends[0] <= tick <= ends[1]]
         bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks], minor=False)
         bar.minorticks_off()

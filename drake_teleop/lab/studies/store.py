@@ -1,7 +1,7 @@
 """Storage of a study's rows on disk; after a crash, each file is complete or absent.
 
-The folder `runs.parquet` is one table, with a file for each chunk of runs. Shard K/N, for computers
-that share only a file system, runs every N-th chunk into the folder `shards/K-of-N` of the study.
+The folder `runs.parquet` has a file for each chunk of runs. Shard K/N, for computers that share
+only files, runs every N-th chunk into the folder `shards/K-of-N`.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Store:
     def clear_start_count_of_chunk(self, first_run: int) -> None:
         (self._run_start_counts_folder / str(first_run)).unlink(missing_ok=True)
 
-    def first_runs_of_chunks_started_at_least(self, times: int) -> set[int]:
+    def first_runs_of_chunks_by_min_starts(self, times: int) -> set[int]:
         marks = (mark for mark in self._run_start_counts_folder.glob("*") if mark.name.isdecimal())
         return {int(mark.name) for mark in marks if mark.stat().st_size >= times}
 
@@ -126,7 +126,7 @@ def open_store(out: Path, identity: dict[str, Any]) -> Iterator[Store]:
 
 @contextmanager
 def locked_folder(out: Path, identity: dict[str, Any]) -> Iterator[None]:
-    """Lock the existing folder `out`; raise an error if its content is from other inputs."""
+    """Lock folder `out`; raise an error if its results are of other inputs (`identity`)."""
     handle = os.open(out, os.O_RDONLY)
     try:
         try:
@@ -141,7 +141,7 @@ def locked_folder(out: Path, identity: dict[str, Any]) -> Iterator[None]:
 
 
 def write_or_check_identity(out: Path, identity: dict[str, Any]) -> None:
-    """Write `identity` into a new folder `out`; raise an error if an old one has another."""
+    """Write `identity`, JSON data of all inputs, into `out`; raise an error if it differs."""
     path = out / "study.json"
     text = json.dumps(identity, indent=2) + "\n"
     if not path.exists():

@@ -19,7 +19,7 @@ from drake_teleop.lab.run import run_scenario
 from drake_teleop.lab.studies.design import FactorValues, Study
 from drake_teleop.lab.studies.effects import main_effects_table
 from drake_teleop.lab.studies.measures import evaluate_measures
-from drake_teleop.lab.studies.runs import ONE_TIME_COST_KEY, run_study
+from drake_teleop.lab.studies.runs import SETUP_TIME_S_KEY, run_study
 from drake_teleop.lab.studies.store import parse_shard
 from drake_teleop.station import scenario as scenarios
 
@@ -54,7 +54,7 @@ class StationRunFunction:
         simulated = scenario.simulation.settle + float(run.result.t[-1])
         one_time_s = time.monotonic() - start - simulated / run.real_time_factor
         found = evaluate_measures(run.result, scenario, self.measures, self.force_threshold_N)
-        return found | {ONE_TIME_COST_KEY: max(one_time_s, 0.0)}
+        return found | {SETUP_TIME_S_KEY: max(one_time_s, 0.0)}
 
 
 def study_command(

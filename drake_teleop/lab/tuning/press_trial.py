@@ -35,23 +35,23 @@ from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.station import MakeTeleopStation
 
-MAX_RENDERED_FORCE_ERROR = 0.1
+MAX_RELATIVE_FORCE_ERROR = 0.1
 """Largest accepted error of the rendered force, as a share of the scaled contact force."""
-MAX_TUNED_FORCE_ERROR = 0.075
+MAX_SEARCH_FORCE_ERROR = 0.075
 """Smaller limit for settings that `tune` chooses, as a margin for other seeds and walls."""
-SEARCH_MEASURES = ["gamma_limit", "linear_limit", "share"]
-TRIAL_MEASURES = ["rests", "rest_force_N", "share", "free_force_N", "contact_N", "threshold_N"]
+ONE_AXIS_SEARCH_MEASURES = ["gamma_limit", "linear_limit", "share"]
+PRESS_MEASURES = ["rests", "rest_force_N", "share", "free_force_N", "contact_N", "threshold_N"]
 _PRESS_SETTLE_TIME_S, _REST_WINDOW_S = 1.5, 0.8  # from the press to the window of rest; its length
 _HAND_SETTLE_TIME_S = 0.1  # s, from the end of the swing until the hand is at rest
 _MAX_PRESS_DEPTH_M = 0.02
-_USED_PEAK_FORCE_SHARE = 0.6  # share of the device's peak force that is used
-_FILTER_DELAY_BANDWIDTH_PRODUCT = 0.416  # of the 4th-order Butterworth filter
+_PEAK_FORCE_SHARE = 0.6  # share of the device's peak force that is used
+_FILTER_DELAY_TIMES_CUTOFF_HZ = 0.416  # of the 4th-order Butterworth filter
 _MIN_GAMMA, _LOG_GAMMA_RESOLUTION = 0.05, 0.03  # smallest gamma; resolution of its logarithm
 _TESTED_GAMMAS = np.geomspace(_MIN_GAMMA, 200.0, 160)
 _MIN_WALL_N_M, _MAX_WALL_N_M = 100.0, 60e3  # N/m, range of the leaf's model
 _NUM_TESTED_WALL_STIFFNESSES = 4  # from the softest to the stiffest
 _MAX_STEP_S = 2e-3  # longer than the events' period; else tiny steps precede the events
-USER_SETTINGS_NAME = "as given"
+METHOD_NAME_OF_USER_SETTINGS = "as given"
 """Name in place of a method: passivity and scales of the user's scenario."""
 
 
@@ -87,7 +87,7 @@ class OperatingRange:
 
     @property
     def tested_parts(self) -> list[tuple[float, list[str], list[float]]]:
-        """Parts of the test, each with its own seed: factor of gamma, grips, walls [N/m]."""
+        """Parts of the test, each with its own seed: (factor of gamma, grips, walls [N/m])."""
         low, high = self.walls
         margin, hands = self.requirements.loop_gain_margin, list(self.hands)
         walls = np.geomspace(high, low, _NUM_TESTED_WALL_STIFFNESSES if low < high else 1).tolist()
@@ -126,7 +126,7 @@ def _check_names_are_known(where: str, names: Sequence[str], known: tuple[str, .
             raise DrakeTeleopError(f"'{name}' is unknown", where=where, remedy=remedy)
 
 
-def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario:
+def without_task_and_passivity_method(scenario: Scenario, network: str | None) -> Scenario:
     """Return the scenario without environment, task, passivity method and displayed load.
 
     `network` is a preset; None keeps the scenario's network.
@@ -163,7 +163,7 @@ class TunedSettings:
     low_pass_hz: float
 
     def passivity(self, operating_range: OperatingRange) -> PassivityConfig:
-        """Return the passivity settings; `charged_tdpa` assumes the range's firmest grip."""
+        """Return passivity settings; method charged_tdpa assumes the firmest grip of the range."""
         hand = GRIP_IMPEDANCES[operating_range.hands[-1]]
         stiffness = [hand.stiffness, hand.rotational_stiffness]
         known = dataclasses.replace(charged_tdpa_config(), hand_stiffness=stiffness)
@@ -184,7 +184,7 @@ class TunedSettings:
         )
 
 
-def settings_from_values(values: FactorValues) -> TunedSettings:
+def settings_of_point(values: FactorValues) -> TunedSettings:
     names = [entry.name for entry in dataclasses.fields(TunedSettings)]
     return TunedSettings(**{name: values[name] for name in names})  # type: ignore[arg-type]
 
@@ -201,8 +201,8 @@ class StationPressTrial:
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
         grip, wall = str(values["hand"]), float(values["wall"])  # type: ignore[arg-type]
         scenario = self.user_scenario
-        if values["method"] != USER_SETTINGS_NAME:
-            scenario = settings_from_values(values).apply(self.base_scenario, self.operating_range)
+        if values["method"] != METHOD_NAME_OF_USER_SETTINGS:
+            scenario = settings_of_point(values).apply(self.base_scenario, self.operating_range)
         scenario = replace(scenario, operator__grip=grip, simulation__seed=seed)
         channel, passivity = self.base_scenario.channel, scenario.passivity
         task = short_press_task(sum(map(mean_delay, channel.networks_of_directions())))
@@ -212,7 +212,7 @@ class StationPressTrial:
         try:
             result = simulate(station, setup.simulation, progress=False)
         except DrakeTeleopError:  # it left its joint ranges
-            return dict.fromkeys(TRIAL_MEASURES, 0.0) | {"threshold_N": np.inf}
+            return dict.fromkeys(PRESS_MEASURES, 0.0) | {"threshold_N": np.inf}
         found = measures_of_press(result, setup, task)
         hold = task.is_held(result.t)
         scaling = scenario.force_scaling
@@ -236,14 +236,14 @@ class StationPressTrial:
 
 @dataclass(frozen=True)
 class OneAxisGammaSearch:
-    """Study function: find the largest gamma that is stable and accurate at all `corners`."""
+    """Study function: find the largest contact force share that is stable in the whole range."""
 
     base_scenario: Scenario
     operating_range: OperatingRange
     gamma_upper_bounds: dict[float, float]  #: low-pass [Hz] -> largest tried gamma
 
     def __call__(self, values: FactorValues, seed: int) -> dict[str, float]:
-        settings = settings_from_values(values | {"gamma": 1.0})
+        settings = settings_of_point(values | {"gamma": 1.0})
         axis = OneAxisFromScenario(self.base_scenario, (0.0, 0.0, 1.0))
         axis = dataclasses.replace(axis, sigma=settings.sigma_inertia, wall_damping=0.0)
         linear = self._max_gamma_of_linear_model(axis, settings)
@@ -256,7 +256,7 @@ class OneAxisGammaSearch:
             tried, found = dataclasses.replace(settings, gamma=float(np.exp(log_gamma))), []
             for corner in self.operating_range.corners:
                 found.append(self.displayed_force_share(axis, tried, *corner, seed))
-                if not is_force_share_accepted(found[-1], MAX_TUNED_FORCE_ERROR):
+                if not is_force_share_accepted(found[-1], MAX_SEARCH_FORCE_ERROR):
                     return -1.0
             shares[tried.gamma] = min(found)
             return 1.0
@@ -289,7 +289,7 @@ class OneAxisGammaSearch:
         shown["force_scale"] *= held.position_scale
         model = OneDof(**shown | {"wall_stiffness": wall, "gamma": settings.gamma})
         ideal = self.base_scenario.wrist_sensor.ideal
-        added = 0.0 if ideal else _FILTER_DELAY_BANDWIDTH_PRODUCT / settings.low_pass_hz
+        added = 0.0 if ideal else _FILTER_DELAY_TIMES_CUTOFF_HZ / settings.low_pass_hz
         task = short_press_task(mean_delay(forward) + mean_delay(backward))
         passivity, intent = settings.passivity(self.operating_range), one_dof.operator_intent(task)
         later = {name: getattr(backward, name) + added for name in ("delay", "playout")}
@@ -300,7 +300,7 @@ class OneAxisGammaSearch:
         return found.rendered_share if found.stable and noise <= MAX_REST_FORCE_N else 0.0
 
 
-def is_force_share_accepted(share: float, max_error: float = MAX_RENDERED_FORCE_ERROR) -> bool:
+def is_force_share_accepted(share: float, max_error: float = MAX_RELATIVE_FORCE_ERROR) -> bool:
     return abs(share - 1.0) <= max_error
 
 
@@ -324,11 +324,11 @@ def renderable_press_depth(base: Scenario, grip: str) -> float:
     """Return the hand's target depth [m] in a wall, limited by the device's peak force."""
     sheet = base.master.figures or FIGURES.get(base.master.model)
     peak = PEAK_FORCE_N if sheet is None else sheet.peak_force
-    return min(_MAX_PRESS_DEPTH_M, _USED_PEAK_FORCE_SHARE * peak / GRIP_IMPEDANCES[grip].stiffness)
+    return min(_MAX_PRESS_DEPTH_M, _PEAK_FORCE_SHARE * peak / GRIP_IMPEDANCES[grip].stiffness)
 
 
 def rms_above_5_hz(x: Array, period: float) -> float:
-    """Return the rms above 5 Hz of x (N,), less a fitted parabola; inf if not finite."""
+    """Return the rms above 5 Hz of x (N,) minus its fitted parabola; inf if not finite."""
     if not np.isfinite(x).all() or len(x) < 4:
         return float("inf")
     t = np.linspace(-1.0, 1.0, len(x))

@@ -1,8 +1,7 @@
 """`drake-teleop tune`: method, sigma, gamma, force scale and filter for a station.
 
-The settings must meet the requirements for all stated hands and walls (`OperatingRange`). Stages of
-the search: limit of the linear loop; simulation in one axis; the whole station with all grips at
-the softest to stiffest wall and several seeds.
+The settings must meet the requirements for all given hands and walls. The search uses the linear
+loop's limit, then one-axis simulations, then the whole station with several seeds.
 """
 
 from __future__ import annotations
@@ -34,18 +33,18 @@ CANDIDATE_METHODS = ("none", "ledger", "charged_tdpa", "wave")
 """Candidate passivity methods; other methods are inferior or render too little force."""
 CANDIDATE_SIGMAS = (0.0, 0.3)
 """Candidate sigma_inertia: a larger one helps the hand to hold a wall, and masks contact."""
-FAILURE_SEARCH_WALL_FACTORS = (1.2, 2.0)
+STIFFER_WALL_FACTORS = (1.2, 2.0)
 """Factors of the stiffest wall at which the chosen settings are tested for failure."""
-FAILURE_SEARCH_GAMMA_FACTOR = 1.2
+LARGER_GAMMA_FACTOR = 1.2
 """Factor of gamma times margin at which the chosen settings are tested for failure."""
 _CANDIDATE_LOW_PASS_CUTOFFS_HZ = (100.0, 50.0)  # Hz, candidates below the sensor's own bandwidth
 _MAX_GAMMA_REDUCTION_FACTOR = 16.0  # from the limit in one axis to that of the station
 _GAMMA_RATIO_AT_BISECTION_END = 1.15  # smallest unstable over largest stable gamma
 # Gammas this factor above and below the limit of noise are assumed to fail and to hold.
-_GAMMA_FACTOR_AROUND_NOISE_LIMIT = 1.03
+_GAMMA_STEP_FACTOR_NEAR_NOISE_LIMIT = 1.03
 
 Row = dict[str, Any]
-RunStudy = Callable[[str, Study, Any], list[Row]]
+StudyRunner = Callable[[str, Study, Any], list[Row]]
 
 
 def tune(
@@ -65,12 +64,12 @@ def tune(
     Args:
         scenario: shipped name, YAML file, or scenario.
         out: folder of the results; the same call continues an interrupted one.
-        hands: grips; settings are for all from the softest to the firmest.
-        walls: stiffnesses [kN/m]; settings are for all from the lowest to the highest.
+        hands: softest and firmest grip.
+        walls: lowest and highest stiffness [kN/m].
         network: preset; None: channel of the scenario.
         task: press, touch or insert.
         jobs: number of processes; -1: one for each core.
-        quiet: True hides the sentences and progress bars; `progress` False only the bars.
+        quiet: True hides result sentences and progress bars.
 
     Returns:
         The content of summary.json (docs/choose.md).
@@ -82,7 +81,7 @@ def tune(
     out, stated = Path(out), press_trial.make_operating_range(hands, walls, task)
     if not isinstance(scenario, Scenario):
         files.refuse_to_replace_inputs(out / "tuned.yaml", scenario)
-    base = press_trial.without_task_and_method(given, network)
+    base = press_trial.without_task_and_passivity_method(given, network)
     files.make_folder(out)
     shown = progress and not quiet
     with show_progress(shown) as stage:
@@ -129,14 +128,14 @@ class SearchResult:
     beyond_runs: list[Row]  #: runs with a larger gamma, then at stiffer walls
 
 
-def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult:
+def search_settings(trial: StationPressTrial, execute: StudyRunner) -> SearchResult:
     """Return the stable settings with which the operator detects the smallest contact force."""
     base, stated = trial.base_scenario, trial.operating_range
     margin = stated.requirements.loop_gain_margin
     own = base.wrist_sensor.bandwidth_hz
     ends = list(dict.fromkeys((stated.hands[0], stated.hands[-1])))
     stiffest = stated.walls[1]
-    unscaled = TunedSettings(press_trial.USER_SETTINGS_NAME, 1.0, 0.0, own)
+    unscaled = TunedSettings(press_trial.METHOD_NAME_OF_USER_SETTINGS, 1.0, 0.0, own)
     given = execute("as_given", _make_press_study(unscaled, ends, [stiffest]), trial)
     unscaled = dataclasses.replace(unscaled, method="ledger")
     quiet = execute("noise", _make_press_study(unscaled, ends, [stiffest]), trial)
@@ -151,7 +150,7 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
         Factor(field="sigma_inertia", values=list(CANDIDATE_SIGMAS)),
         Factor(field="low_pass_hz", values=low_passes),
     ]
-    study = Study(factors=factors, measures=press_trial.SEARCH_MEASURES)
+    study = Study(factors=factors, measures=press_trial.ONE_AXIS_SEARCH_MEASURES)
     rows = execute("search", study, press_trial.OneAxisGammaSearch(base, stated, caps))
     search = [_add_predicted_force_threshold(row, trial, noises) for row in rows]
     candidates: dict[str, Row] = {}  # the best of each method
@@ -162,9 +161,9 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
     for row in candidates.values():
         if found and found[0][0] <= row["threshold_N"]:
             break
-        gamma, inside = _search_max_gamma(press_trial.settings_from_values(row), trial, execute)
+        gamma, inside = _search_max_gamma(press_trial.settings_of_point(row), trial, execute)
         if inside:
-            chosen = dataclasses.replace(press_trial.settings_from_values(row), gamma=gamma)
+            chosen = dataclasses.replace(press_trial.settings_of_point(row), gamma=gamma)
             found.append((row["threshold_N"] * row["gamma"] / gamma, chosen, inside))
             found.sort(key=lambda entry: entry[0])
     if not found:
@@ -172,18 +171,18 @@ def search_settings(trial: StationPressTrial, execute: RunStudy) -> SearchResult
         remedy = "give firmer --hands, softer --walls or a faster --network"
         raise DrakeTeleopError(what, where="tune", remedy=remedy)
     _, chosen, inside = found[0]
-    larger = dataclasses.replace(chosen, gamma=FAILURE_SEARCH_GAMMA_FACTOR * margin * chosen.gamma)
+    larger = dataclasses.replace(chosen, gamma=LARGER_GAMMA_FACTOR * margin * chosen.gamma)
     beyond = execute("larger_gamma", _make_press_study(larger, ends, [stiffest], repeats=2), trial)
-    walls = [factor * stiffest for factor in FAILURE_SEARCH_WALL_FACTORS]
+    walls = [factor * stiffest for factor in STIFFER_WALL_FACTORS]
     beyond += execute("stiffer_walls", _make_press_study(chosen, ends, walls, repeats=2), trial)
     return SearchResult(chosen, search, given, inside, beyond)
 
 
 def _search_max_gamma(
-    settings: TunedSettings, trial: StationPressTrial, execute: RunStudy
+    settings: TunedSettings, trial: StationPressTrial, execute: StudyRunner
 ) -> tuple[float, list[Row]]:
     def all_meet_requirements(rows: list[Row]) -> bool:
-        return all(meets_requirements(row, press_trial.MAX_TUNED_FORCE_ERROR) for row in rows)
+        return all(meets_requirements(row, press_trial.MAX_SEARCH_FORCE_ERROR) for row in rows)
 
     gamma, stable, failed = settings.gamma, 0.0, np.inf
     smallest = gamma / _MAX_GAMMA_REDUCTION_FACTOR
@@ -203,8 +202,8 @@ def _search_max_gamma(
             if all_meet_requirements([row | {"rest_force_N": 0.0} for row in rows]):
                 # Noise grows with gamma.
                 quiet = gamma * MAX_REST_FORCE_N / max(row["rest_force_N"] for row in rows)
-                smaller = max(smaller, quiet / _GAMMA_FACTOR_AROUND_NOISE_LIMIT)
-                failed = min(failed, quiet * _GAMMA_FACTOR_AROUND_NOISE_LIMIT)
+                smaller = max(smaller, quiet / _GAMMA_STEP_FACTOR_NEAR_NOISE_LIMIT)
+                failed = min(failed, quiet * _GAMMA_STEP_FACTOR_NEAR_NOISE_LIMIT)
         if failed == np.inf or failed <= _GAMMA_RATIO_AT_BISECTION_END * stable:
             break
         gamma = float(np.sqrt(stable * failed)) if stable else smaller
@@ -212,23 +211,27 @@ def _search_max_gamma(
 
 
 def meets_requirements(
-    row: Row, max_force_error: float = press_trial.MAX_RENDERED_FORCE_ERROR
+    row: Row, max_force_error: float = press_trial.MAX_RELATIVE_FORCE_ERROR
 ) -> bool:
     """Return whether a run is at rest, quiet and within `max_force_error` of the contact force."""
     exact = press_trial.is_force_share_accepted(row["share"], max_force_error)
     return bool(row["rests"] and row["rest_force_N"] <= MAX_REST_FORCE_N and exact)
 
 
-def make_study_executor(out: Path, inputs: dict[str, Any], jobs: int, progress: bool) -> RunStudy:
-    """Return a function that runs a study in a folder of `out` with the study's name."""
+def make_study_executor(
+    out: Path, inputs: dict[str, Any], jobs: int, progress: bool
+) -> StudyRunner:
+    """Return a function that runs a named study in the folder `out` / name."""
 
-    def execute(name: str, study: Study, work: Any) -> list[Row]:
+    def execute(name: str, study: Study, run_function: Any) -> list[Row]:
         with show_progress(progress) as stage:
 
-            def name_progress(_: str) -> UpdateProgress:
+            def start_trials(_: str) -> UpdateProgress:
                 return stage(f"Trials {name}")
 
-            found = run_study(study, out / name, work, inputs, jobs=jobs, progress=name_progress)
+            found = run_study(
+                study, out / name, run_function, inputs, jobs=jobs, progress=start_trials
+            )
         for row in found.rows(named=True):
             if row["error"]:
                 raise DrakeTeleopError(str(row["error"]), where=f"tune:{name}")
@@ -262,7 +265,7 @@ def _make_press_study(
     factors = [Factor(field="method", words=[numbers.pop("method")])]
     factors += [Factor(field=name, values=[number]) for name, number in numbers.items()]
     factors += [Factor(field="hand", words=hands), Factor(field="wall", values=walls)]
-    return Study(factors=factors, measures=press_trial.TRIAL_MEASURES, seed=seed, repeats=repeats)
+    return Study(factors=factors, measures=press_trial.PRESS_MEASURES, seed=seed, repeats=repeats)
 
 
 def _make_tuning_summary(
@@ -355,6 +358,6 @@ def draw_detectable_force_over_margin(result: SearchResult, summary: dict[str, A
         figures = summary["figures"]
         axes.plot(figures["margin"], figures["threshold_N"], "o", color=BLACK, label="chosen")
         axes.set(yscale="log", ylabel="smallest detected contact force [N]")
-        axes.set_xlabel("margin: factor by which gamma may grow")
+        axes.set_xlabel("factor of gamma up to instability")
         axes.legend()
     return figure

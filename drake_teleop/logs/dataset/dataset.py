@@ -21,7 +21,7 @@ from drake_teleop.common import files
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import replace_file_on_success
 from drake_teleop.common.html import render_page
-from drake_teleop.common.numeric import Array, one_blas_thread, samples_to_nearest_flag
+from drake_teleop.common.numeric import Array, one_blas_thread, samples_to_nearest_true
 from drake_teleop.common.progress import show_progress
 from drake_teleop.common.texts import read_yaml, to_yaml_text
 from drake_teleop.load.contact.detection import ContactDetector
@@ -354,7 +354,7 @@ def _contact_wrench_and_contact_flags(
         contact = found.wrench_of_reading(residual)
         detector = ContactDetector(shared.noise_floor, shared.threshold, statistic="level", hold=1)
         touched = detector.detect(*shared_load.samples_for_detector(signals, found.lag, contact))
-        free = samples_to_nearest_flag(touched) > _CONTACT_MARGIN_FRAMES
+        free = samples_to_nearest_true(touched) > _CONTACT_MARGIN_FRAMES
         if free.sum() < _MIN_FREE_FRAMES_FOR_OFFSETS:
             break
         residual = residual - residual[free].mean(axis=0)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, samples_to_nearest_flag
+from drake_teleop.common.numeric import Array, samples_to_nearest_true
 from drake_teleop.load.batch.consistent import consistent_least_squares
 from drake_teleop.load.batch.uncertainty import parameter_errors_by_gains
 from drake_teleop.load.contact import detection
@@ -80,7 +80,7 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
     limit, free = _MIN_CONTACT_DEVIATIONS * typical / episode_verdict.STANDARD_NORMAL_QUARTILE, []
     for episode, (x, residual) in zip(chosen, usual, strict=True):
         contact = residual - x.offsets
-        frames_from_touch = samples_to_nearest_flag((np.abs(contact) > limit).any(axis=1))
+        frames_from_touch = samples_to_nearest_true((np.abs(contact) > limit).any(axis=1))
         samples = samples_for_detector(episode.signals, x.lag, contact)
         free.append(samples.select_rows(frames_from_touch > _CONTACT_MARGIN_FRAMES))
     pooled = DetectorSamples(*(np.concatenate(parts) for parts in zip(*free, strict=True)))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.numeric import Array, position_of_parabola_minimum, samples_to_nearest_flag
+from drake_teleop.common.numeric import Array, position_of_parabola_minimum, samples_to_nearest_true
 from drake_teleop.load.batch.methods import NOTHING_REJECTED_NOTE
 from drake_teleop.logs.pose_motion import spectra as spectral
 from drake_teleop.logs.pose_motion.poses import Poses
@@ -338,7 +338,7 @@ def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool
             break
     if not rejected.any():
         return rejected, ""
-    rejected = samples_to_nearest_flag(rejected) * grid.dt <= max(_MIN_REJECTION_MARGIN_S, spacing)
+    rejected = samples_to_nearest_true(rejected) * grid.dt <= max(_MIN_REJECTION_MARGIN_S, spacing)
     if _std_growth_by_rejection(test_signals, inside, inside & ~rejected) > _MAX_FIT_STD_GROWTH:
         return np.zeros(len(x), bool), NOTHING_REJECTED_NOTE
     return rejected, ""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.fft import next_fast_len
 
-from drake_teleop.common.numeric import Array, finite_array, samples_to_nearest_flag
+from drake_teleop.common.numeric import Array, finite_array, samples_to_nearest_true
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.normal_equations import omega_product_jacobians
 from drake_teleop.logs.pose_motion.splines import (
@@ -120,7 +120,7 @@ def exclude_from_taper(
     taper: Array, lost: NDArray[np.bool_], dt: float, margin: float = 0.0
 ) -> Array:
     """Return the taper (M,) with zeros within `margin` [s] of `lost` instants, and cosine edges."""
-    edge = np.clip((samples_to_nearest_flag(lost) * dt - margin) / _EXCLUSION_RAMP_S, 0.0, 1.0)
+    edge = np.clip((samples_to_nearest_true(lost) * dt - margin) / _EXCLUSION_RAMP_S, 0.0, 1.0)
     return np.asarray(taper * (0.5 - 0.5 * np.cos(np.pi * edge)))
 
 

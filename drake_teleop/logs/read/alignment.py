@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, finite_array, samples_to_nearest_flag, to_float
+from drake_teleop.common.numeric import Array, finite_array, samples_to_nearest_true, to_float
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.read.canonical import Log
@@ -192,7 +192,7 @@ def is_far_from_gaps(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
     if log.bridged is None:
         return np.ones(len(log), bool)
     reach = 0 if cutoff_hz is None else math.ceil(2 / (cutoff_hz * log.dt))
-    return samples_to_nearest_flag(log.bridged) > reach
+    return samples_to_nearest_true(log.bridged) > reach
 
 
 def is_near_ends(log: Log, length_s: float, cutoff_hz: float | None) -> NDArray[np.bool_]:
@@ -222,7 +222,7 @@ def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) 
     reach = min(MAX_SEARCHED_DELAY_S, 0.1 * float(log.t[-1] - log.t[0]))
     step = min(1 / (8 * cutoff), reach / 8)
     inside = (smooth.t >= smooth.t[0] + reach) & (smooth.t <= smooth.t[-1] - reach)
-    inside &= samples_to_nearest_flag(~is_far_from_gaps(log, cutoff)) > math.ceil(reach / log.dt)
+    inside &= samples_to_nearest_true(~is_far_from_gaps(log, cutoff)) > math.ceil(reach / log.dt)
     inside = np.flatnonzero(inside)
     if len(inside) < _MIN_SAMPLES_FOR_DELAY:
         return None

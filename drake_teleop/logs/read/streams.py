@@ -92,7 +92,7 @@ class OrientationColumns:
         self, description: Description, described: Orientation, table: Table, rows: int, where: str
     ) -> None:
         self._orientation, self._table, self._where = described, table, where
-        width = rotations.NUM_COLUMNS_OF_ROTATION_FORM[described.form]
+        width = rotations.NUM_COLUMNS_BY_ROTATION_FORM[described.form]
         self._columns = table.finite_numbers(described.columns, width, f"{where}.columns", rows)
         if described.form in ("rotation_vector", "euler"):
             self._columns *= description.unit_in_si(described.unit)
