@@ -40,7 +40,7 @@ from drake_teleop.logs.causes.cause import (
 )
 from drake_teleop.logs.causes.explain import MisfitExplanation
 from drake_teleop.logs.check import against_load, conventions, edits
-from drake_teleop.logs.check.against_load import MAX_GOOD_UNEXPLAINED, lag_findings
+from drake_teleop.logs.check.against_load import MAX_GOOD_RESIDUAL_SHARE, lag_findings
 from drake_teleop.logs.check.conventions import ConventionCheckResult, check_conventions_of_file
 from drake_teleop.logs.check.handedness import left_handed_pose_finding
 from drake_teleop.logs.check.motion_size import MORE_MOTION_REMEDY, explain_lack_of_motion
@@ -242,7 +242,7 @@ def _left_handed_pose_finding(log: Log, fitted: LoadFitOfLog) -> Finding | None:
         return None
     load, shown = fitted.fit.identification, fitted.log
     residual = contact_wrench(shown.wrench, load.offsets, *shown.motion, load.phi)
-    if against_load.unexplained_share(shown.wrench, residual) < MAX_GOOD_UNEXPLAINED:
+    if against_load.unexplained_share(shown.wrench, residual) < MAX_GOOD_RESIDUAL_SHARE:
         return None
     splines = None if fitted.motion is None else fitted.motion.splines
     return left_handed_pose_finding(shown, splines, fitted.delay_s)
@@ -355,7 +355,7 @@ def _apply_explanation(
         causes = explained_log.replace_frame_causes(misfit, frame_findings[0])
     if raw.estimated:
         note = explained_log.removed_weight_note(misfit)
-    elif causes and not misfit.needs_full_gain_matrix:
+    elif causes and not misfit.needs_crosstalk_calibration:
         note = ""
     return explained_log.apply_explanation_to_load(load, misfit), causes, note
 

@@ -25,7 +25,7 @@ ALPHA_SIGNALS, OMEGA_PRODUCTS = slice(7, 10), slice(10, 16)
 WRENCH_SIGNALS, WRENCH_RATE_SIGNALS = slice(16, 22), slice(22, 28)
 ROTATION_SIGNALS, ROTATION_POSITION_PRODUCTS = slice(28, 37), slice(37, 64)
 TIME_POLYNOMIALS, NUM_SIGNALS = slice(64, 67), 67
-COLUMNS_REPEATED_BY_STEP = np.r_[0:16, 28:37]
+STEP_CHANGE_SIGNAL_INDICES = np.r_[0:16, 28:37]
 """Columns of the load's wrench; a step at t1 repeats them, multiplied by u(t - t1)."""
 _INSTANT_RATE_HZ, _MAX_INSTANTS = 50.0, 20_000
 _BLOCK_LENGTH_S, _MAX_BLOCKS, _MIN_BLOCK_ROWS = 0.25, 320, 5
@@ -37,7 +37,7 @@ _MAX_TRIED_DELAY_S, _DELAY_STEP_S = 0.25, 0.01
 _CONSTANT_AND_MOTION_COLUMNS = slice(0, 16)
 _OMEGA_PRODUCT_AXIS_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
-MotionAtTime = Callable[[Array], tuple[Array, ...]]
+MotionByTime = Callable[[Array], tuple[Array, ...]]
 """Function of times (K,): s, omega, alpha (K, 3); if known R_WS (K, 3, 3) and p (K, 3)."""
 
 
@@ -86,7 +86,7 @@ class BlockMeans:
         least = -(-len(self.t) // _MAX_BLOCKS)
         return max(least, _MIN_BLOCK_ROWS, round(_BLOCK_LENGTH_S / self.dt))
 
-    def with_other_rows_zeroed(self, used: NDArray[np.bool_]) -> BlockMeans:
+    def with_only_used_rows(self, used: NDArray[np.bool_]) -> BlockMeans:
         return replace(self, y=np.where(used[:, None], self.y, 0.0), used=used)
 
     def append_step_signals(self, times: tuple[float, ...]) -> Array:
@@ -98,7 +98,7 @@ class BlockMeans:
         parts = [self.y]
         for time in times:
             share = np.clip((self.t - time) / self.dt + 0.5, 0.0, 1.0)
-            parts.append(self.y[:, COLUMNS_REPEATED_BY_STEP] * share[:, None])
+            parts.append(self.y[:, STEP_CHANGE_SIGNAL_INDICES] * share[:, None])
         return np.hstack(parts)
 
     def lagged_block_sums(self, y: Array, *, rows: int, lags: int = AR_ORDER + 1) -> Array:
@@ -120,7 +120,7 @@ class BlockMeans:
 def block_means_of_record(
     t: Array,
     wrench: Array,
-    motion: MotionAtTime | tuple[Array, ...],
+    motion: MotionByTime | tuple[Array, ...],
     gravity_W: Array | None,
     lost: NDArray[np.bool_] | None = None,
     acceleration_noise: float = 0.0,
@@ -155,7 +155,7 @@ def block_means_of_record(
     share = _smooth_noisy_alpha_and_get_noise_share(y, used) if gravity_W is None else 0.0
     noise = white / np.sqrt(size)
     out = BlockMeans(middle, y, used, noise, gravity_W, positions, acceleration_noise, share)
-    return out.with_other_rows_zeroed(used)
+    return out.with_only_used_rows(used)
 
 
 def _smooth_noisy_alpha_and_get_noise_share(y: Array, used: NDArray[np.bool_]) -> float:
@@ -176,7 +176,7 @@ def _min_noise_share_of_channels(x: Array) -> float:
 
 
 def _write_motion_and_get_has_positions(
-    y: Array, t: Array, size: int, motion: MotionAtTime | tuple[Array, ...], gravity_W: Array | None
+    y: Array, t: Array, size: int, motion: MotionByTime | tuple[Array, ...], gravity_W: Array | None
 ) -> bool:
     rows, total = len(y), np.zeros(())
     if not callable(motion) or size <= _MAX_EXACTLY_AVERAGED_SAMPLES:
@@ -206,20 +206,20 @@ def _motion_signal_columns(motion: Sequence[Array], gravity_W: Array | None) -> 
     return np.hstack(parts)
 
 
-def delay_of_linear_fit(data: BlockMeans) -> float:
+def delay_of_linear_fit(means: BlockMeans) -> float:
     """Return the motion delay behind the wrench [s] with the best linear fit.
 
     The fit combines 16 motion signals freely, without a rigid load. The delay is within 0.25 s and
     a tenth of the record; return 0 if it is at an end of this range.
     """
-    reach = min(_MAX_TRIED_DELAY_S, 0.1 * float(data.t[-1] - data.t[0]))
-    rows = data.used & (data.t > data.t[0] + reach) & (data.t < data.t[-1] - reach)
-    spline = CubicSpline(data.t, data.y[:, _CONSTANT_AND_MOTION_COLUMNS])
-    forces = data.y[rows][:, WRENCH_SIGNALS]
+    reach = min(_MAX_TRIED_DELAY_S, 0.1 * float(means.t[-1] - means.t[0]))
+    rows = means.used & (means.t > means.t[0] + reach) & (means.t < means.t[-1] - reach)
+    spline = CubicSpline(means.t, means.y[:, _CONSTANT_AND_MOTION_COLUMNS])
+    forces = means.y[rows][:, WRENCH_SIGNALS]
     total = (forces * forces).sum(axis=0)
 
     def sum_ln_squared_residuals(shift_s: float) -> float:
-        x = spline(data.t[rows] + shift_s)
+        x = spline(means.t[rows] + shift_s)
         size = np.sqrt((x * x).mean(axis=0))
         x = x[:, size > 1e-9 * size.max()]
         x /= np.sqrt((x * x).mean(axis=0))

@@ -37,13 +37,13 @@ from drake_teleop.logs.read.alignment import (
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
 
-MAX_GOOD_UNEXPLAINED = 0.02
+MAX_GOOD_RESIDUAL_SHARE = 0.02
 """Largest unexplained share of the variance, without white noise, of a good fit."""
-MAX_VALID_UNEXPLAINED = 0.05
+MAX_VALID_RESIDUAL_SHARE = 0.05
 """Largest unexplained share of the variance, without white noise, of a valid description."""
 MIN_MISFIT_REDUCTION_BY_EDIT = 4.0  # least factor on the unexplained share
 _FALSE_ALARM_RATE, _NUM_TESTED_EDITS = 1e-6, 50
-_FINDINGS_NOT_COMBINED_WITH_SIGN = ("sign", "swapped axes")
+_FINDINGS_WITHOUT_WRENCH_SIGN_EDIT = ("sign", "swapped axes")
 """Sign, and axes: with the opposite sign they are mirrored, a cause that `identify` reports."""
 _KEPT_SHARE_WITHOUT_CONTACT = 0.75  # of a record with contact
 _LOAD_FIT_CUTOFF_HZ, _MAX_FITTED_SAMPLES = 15.0, 1500
@@ -60,12 +60,12 @@ class LoadFitQuality:
 
     @property
     def is_good(self) -> bool:
-        limit = self.max_unexplained_including_noise(MAX_GOOD_UNEXPLAINED)
+        limit = self.max_unexplained_including_noise(MAX_GOOD_RESIDUAL_SHARE)
         return self.mass > 0 and self.unexplained < limit
 
     def max_unexplained_including_noise(self, limit_without_noise: float) -> float:
         """Return the limit of `unexplained`: `limit_without_noise` plus noise, at most 0.9."""
-        return min(limit_without_noise + self.noise_share, MIN_UNEXPLAINED_OF_UNKNOWN_LOAD)
+        return min(limit_without_noise + self.noise_share, MIN_RESIDUAL_SHARE_OF_UNKNOWN_LOAD)
 
 
 def fit_load(log: Log, kept_share: float = 1.0) -> LoadFitQuality:
@@ -148,7 +148,7 @@ def _wrench_channel_scales(wrench: Array) -> Array:
     return np.repeat([force + least, max(torque, 0.03 * force) + least], 3)
 
 
-MIN_UNEXPLAINED_OF_UNKNOWN_LOAD = 0.9  # share of the variance
+MIN_RESIDUAL_SHARE_OF_UNKNOWN_LOAD = 0.9  # share of the variance
 MIN_REPORTED_LAG_S = 0.002
 _NUM_DELAY_PARTS, _MIN_DELAY_PARTS = 8, 4
 _MIN_DELAY_DRIFT_S, _MAX_DELAY_DEVIATION_OVER_DRIFT = 0.03, 0.15
@@ -224,12 +224,12 @@ def _select_far_better_edits(
             continue
         if fit.mass > 0:
             positive.append((fit, finding, edited))
-        elif finding is not None and finding.name not in _FINDINGS_NOT_COMBINED_WITH_SIGN:
+        elif finding is not None and finding.name not in _FINDINGS_WITHOUT_WRENCH_SIGN_EDIT:
             negative.append((fit, *edits.edit_with_opposite_wrench_sign(finding, edited)))
         elif finding is None:  # a clock and the sign
             negative.append((fit, *next(edits.wrench_and_motion_edits(edited))))
     # A negative mass is impossible: an equally good fit with a positive one suffices.
-    valid = given.max_unexplained_including_noise(MAX_VALID_UNEXPLAINED)
+    valid = given.max_unexplained_including_noise(MAX_VALID_RESIDUAL_SHARE)
     n = max(1.0, given.independent_samples)
     least_factor = float(fdtri(n, n, 1 - _FALSE_ALARM_RATE / _NUM_TESTED_EDITS))
     decisive = given.unexplained / max(MIN_MISFIT_REDUCTION_BY_EDIT, least_factor)
@@ -280,7 +280,7 @@ def _payload_or_lag_findings_and_delay(
     kept = ~fit.rejected
     wrench, (s, omega, alpha) = smooth.wrench[kept], (x[kept] for x in smooth.motion)
     residual = contact_wrench(wrench, load.offsets, s, omega, alpha, load.phi)
-    limit = MAX_VALID_UNEXPLAINED + given.noise_share
+    limit = MAX_VALID_RESIDUAL_SHARE + given.noise_share
     if delay is None or unexplained_share(wrench, residual) > limit:
         return [], None
     if fit.rejected.any():
@@ -292,7 +292,7 @@ def _payload_or_lag_findings_and_delay(
 
 def undetermined_payload_finding(load: Identification, unexplained: float) -> Finding | None:
     """Return a finding if the record does not determine the mass of the load, else None."""
-    if load.verdicts[6] != "not" and unexplained < MIN_UNEXPLAINED_OF_UNKNOWN_LOAD:
+    if load.verdicts[6] != "not" and unexplained < MIN_RESIDUAL_SHARE_OF_UNKNOWN_LOAD:
         return None
     deviation = float(load.standard_deviations[6])
     fitted = "no signal of the record depends on its mass"

@@ -17,7 +17,7 @@ from drake_teleop.common.numeric import Array, one_blas_thread, white_noise_devi
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check import against_load, edits
-from drake_teleop.logs.check.against_load import MAX_GOOD_UNEXPLAINED, LoadFitQuality
+from drake_teleop.logs.check.against_load import MAX_GOOD_RESIDUAL_SHARE, LoadFitQuality
 from drake_teleop.logs.check.edits import LogTables
 from drake_teleop.logs.check.motion_checks import (
     check_imu_against_pose,
@@ -73,7 +73,7 @@ def findings_if_load_is_suspicious(
     unexplained = against_load.unexplained_share(log.wrench, log.wrench - predicted)
     weight = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
     clocks = log.static or (delay is not None and abs(delay) < edits.MIN_LAG_OF_WRONG_CLOCK_S)
-    if load.mass > 0 and unexplained < MAX_GOOD_UNEXPLAINED and clocks and 5.0 < weight < 20.0:
+    if load.mass > 0 and unexplained < MAX_GOOD_RESIDUAL_SHARE and clocks and 5.0 < weight < 20.0:
         # A good fit may hide errors of the IMU, but `check` takes longer than the fit.
         return tuple(_findings_except_lag(check)) if _has_dead_channel_or_imu_finding(log) else ()
     found = _findings_except_lag(check)

@@ -12,8 +12,8 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import axis_names_of_rows, rotation_matrices, signed_permutations
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check.against_load import (
-    MAX_GOOD_UNEXPLAINED,
-    MAX_VALID_UNEXPLAINED,
+    MAX_GOOD_RESIDUAL_SHARE,
+    MAX_VALID_RESIDUAL_SHARE,
     MIN_MISFIT_REDUCTION_BY_EDIT,
 )
 from drake_teleop.logs.check.edits import (
@@ -209,25 +209,25 @@ def check_imu_against_pose(
         return [], None, description
     findings: list[Finding] = []
     is_rotated = given.rotation_angle_deg > 10
-    if given.unexplained > MAX_GOOD_UNEXPLAINED or given.is_mirrored or is_rotated:
+    if given.unexplained > MAX_GOOD_RESIDUAL_SHARE or given.is_mirrored or is_rotated:
         better = [
             (found, finding, edited)
             for finding, edited in orientation_and_gravity_sign_edits(description)
             if (found := call_or_none_if_unreadable(fit_mounting, edited)) and not found.is_mirrored
         ]
-        limit = min(MAX_VALID_UNEXPLAINED, given.unexplained / MIN_MISFIT_REDUCTION_BY_EDIT)
+        limit = min(MAX_VALID_RESIDUAL_SHARE, given.unexplained / MIN_MISFIT_REDUCTION_BY_EDIT)
         if given.is_mirrored:
             better = [entry for entry in better if entry[0].rotation_angle_deg < 10]
-        elif is_rotated and given.unexplained < MAX_VALID_UNEXPLAINED:
+        elif is_rotated and given.unexplained < MAX_VALID_RESIDUAL_SHARE:
             # In a rotation about one axis an inverted orientation resembles a rotated IMU. An edit
             # that keeps the described mounting is the simpler explanation.
             better = [entry for entry in better if entry[0].rotation_angle_deg < 10]
-            limit = min(MAX_VALID_UNEXPLAINED, 1.5 * given.unexplained + 1e-4)
+            limit = min(MAX_VALID_RESIDUAL_SHARE, 1.5 * given.unexplained + 1e-4)
         best = min(better, key=lambda entry: entry[0].unexplained, default=None)
         if best and best[0].unexplained < limit:
             given, finding, description = best
             findings.append(finding)
-    if given.unexplained > MAX_VALID_UNEXPLAINED and not given.is_mirrored:
+    if given.unexplained > MAX_VALID_RESIDUAL_SHARE and not given.is_mirrored:
         return findings, given, description
     if abs(given.lag_s) > MIN_LAG_OF_WRONG_CLOCK_S or given.clock_drift:
         finding, description = _correct_imu_clock(description, given, data)

@@ -221,7 +221,7 @@ def estimate_auto_gravity(description: Description, source: str, read: ReadLog) 
 
     explanation = explain_misfit(block_means_of_log(log), block_means_without_delay, ("gravity",))
     if explanation.theta[6] > 0.0:
-        change, covariance = explanation.state.parameters_of_extension("gravity")
+        change, covariance = explanation.fit.parameters_of_extension("gravity")
         estimated = description.gravity_W - change
         estimated *= STANDARD_GRAVITY / np.linalg.norm(estimated)
         deviation = direction_std_deg(estimated, covariance)
