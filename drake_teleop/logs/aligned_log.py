@@ -72,7 +72,7 @@ def _fit_with_fallback_delay(
 
 
 def use_spline_motion_and_flag_edges(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
-    """Return the log without delay, with spline motion; and flags (N,): True near ends and gaps."""
+    """Return the log without delay, with spline motion; and flags (N,): True near ends, gaps."""
     assert log.posed is not None
     moved, splines = alignment.remove_delay(log, found.delay_s), found.splines
     t, gravity_W = moved.t + found.delay_s, log.posed.gravity_W
@@ -103,7 +103,7 @@ class AlignedLog:
     """Log with motion and wrench at the same instants.
 
     Attributes:
-        log: `specific_force` is the acceleration, `gravity` 0, if the robot removed the weight.
+        log: with gravity 0 and acceleration as specific force if the robot removed the weight.
         delay_s: removed delay of the motion behind the wrench [s].
         delay_source: "estimated", "given", "load" (identification file) or "static".
         log_with_differentiated_motion: log with numerically differentiated motion, if requested.
@@ -130,9 +130,9 @@ def read_aligned_log(
 ) -> AlignedLog:
     """Return the log in a file, without the delay between motion and wrench.
 
-    The motion is from splines of the poses, or from an IMU if the load phi (10,) then fits better.
-    The removed delay is `delay` [s], or its estimate for "auto", or `fallback_delay_s` if the
-    record does not determine it. `differentiate` adds numerically differentiated motion.
+    The motion is from pose splines, or from an IMU if the load phi (10,) then fits better. The
+    removed delay is `delay` [s], or its estimate for "auto", or `fallback_delay_s` if undetermined.
+    `differentiate` adds differentiated motion; `weight_removed`: the robot subtracted the weight.
     """
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=differentiate)
     weight_removed = weight_removed or "weight" in log.estimated
@@ -210,7 +210,7 @@ def fit_load_to_posed_log(
 ) -> tuple[LoadFitOfLog | None, tuple[Finding, ...]]:
     """Return the load identified from wrench and poses, and any finding on unit or frame of poses.
 
-    The load is None for a method without splines, a log at rest, a log without poses over 4 s, or
+    The load is None for a `method` without splines, a log at rest, poses over less than 4 s, or
     an IMU that contradicts the poses.
     """
     is_long = log.t[-1] - log.t[0] >= MIN_SPLINE_RECORD_DURATION_S

@@ -1,4 +1,4 @@
-"""Identification of the load, and its removal, for log files (long: three commands)."""
+"""Identification of the load, and its removal, for log files (long: code of three commands)."""
 
 from __future__ import annotations
 
@@ -251,7 +251,7 @@ def _left_handed_pose_finding(log: Log, fitted: LoadFitOfLog) -> Finding | None:
 def _explain_residual(
     log: Log, fitted: LoadFitOfLog, frame_findings: tuple[Finding, ...]
 ) -> tuple[MisfitExplanation | None, str | None]:
-    """Return causes of the residual, or a text if the motion is too small to separate them.
+    """Return causes of the residual, or the reason why the motion is too small to separate them.
 
     Gain errors within `log.gain_std` are no causes.
     """
@@ -366,7 +366,7 @@ def _unexplained_misfit(
     corrections: list[Finding],
     unexplained: float,
 ) -> MisfitExplanation | None:
-    """Return `misfit` if causes, noise, vibrations or unknown accelerations do not explain it."""
+    """Return `misfit`, or None if causes, noise or a missing acceleration explain it."""
     if misfit is None or not misfit.is_misfit or misfit.is_acceleration_missing:
         return None
     useless = not misfit.causes and unexplained > 0.5
@@ -412,7 +412,7 @@ def _is_misfit_explainable(log: Log, has_splines: bool) -> bool:
 
 
 def check_log(path: Path, checks: ConventionCheckResult | None = None) -> ConventionCheckResult:
-    """Return the checks of a log and its description, with causes that identification finds."""
+    """Identify the load and return `checks` of the log (computed if None), with found causes."""
     checks = check_conventions_of_file(path) if checks is None else checks
     try:
         identified = identify_log(path, checks=checks)
@@ -603,7 +603,7 @@ def _read_and_eliminate_log(
         raise weight_scale_without_effect_error(log.source)
     if weights != inertias and log.gravity is None:
         where = f"{log.source}: gravity in the sensor frame"
-        raise compensation.unknown_gravity_error(where, "add an orientation, or use sigma alone")
+        raise compensation.unknown_gravity_error(where, "add an orientation, or omit sigma_weight")
     if log.gravity is not None:
         rest = np.zeros_like(log.gravity)
         weightless = contact_wrench(log.wrench, np.zeros(6), -log.gravity, rest, rest, phi)
@@ -707,7 +707,7 @@ def _check_log_if_contact_is_large(
 
 def weight_scale_without_effect_error(where: str) -> DrakeTeleopError:
     what = "the robot has removed the weight, so that sigma_weight has no effect"
-    return DrakeTeleopError(what, where=where, remedy="use sigma alone, which scales the inertia")
+    return DrakeTeleopError(what, where=where, remedy="omit sigma_weight; sigma scales the inertia")
 
 
 def _resolve_force_scales(
@@ -716,7 +716,7 @@ def _resolve_force_scales(
     for name, value in given_scales.items():
         if value is not None and not 0.0 <= to_float(name, value) <= _MAX_TELEOP_FORCE_SCALE:
             what = f"{value:g} is outside 0 to {_MAX_TELEOP_FORCE_SCALE:g}"
-            raise DrakeTeleopError(what, where=name, remedy="give a scale, such as 0 or 1")
+            raise DrakeTeleopError(what, where=name, remedy="give a force scale, such as 0 or 1")
     sigma, kept, gamma, *separate = given_scales.values()
     if kept is not None and not has_gripper:
         what = "sigma_object requires a gripper"

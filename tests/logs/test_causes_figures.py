@@ -186,7 +186,11 @@ def test_contact_spans_cover_the_contact_and_cost_two_numbers_an_end(
     ((found_start, found_stop),) = find_contact_spans(fit)
     assert max(start, T[0] - 0.02) - 0.7 < found_start <= max(start, T[0])
     assert min(stop, T[-1]) <= found_stop < min(stop, T[-1]) + 0.7
-    for name in ("_fit_extension", "_torque_factor_candidates", "_axis_permutation_candidates"):
+    for name in (
+        "_fit_with_extension",
+        "_torque_factor_candidates",
+        "_axis_permutation_candidates",
+    ):
         monkeypatch.setattr(f"drake_teleop.logs.causes.candidates.{name}", lambda *_: iter(()))
     monkeypatch.setattr("drake_teleop.logs.causes.candidates.add_step_change", lambda *_: None)
     monkeypatch.setattr("drake_teleop.logs.causes.candidates._MIN_CHANNEL_GAIN_ERROR", 1.0)

@@ -59,7 +59,7 @@ _MAX_SCORE_OF_UNUSUAL_TORQUE_FACTOR = 30.0  # score that widens intervals but na
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Fit with one more extension; `score` is twice its gain in log likelihood minus a BIC cost."""
+    """Fit with one more model term; `score` is twice its log likelihood gain, minus a BIC cost."""
 
     name: str
     fit: FittedModel
@@ -67,7 +67,7 @@ class Candidate:
 
 
 def fit_candidates(fit: FittedModel, is_first_round: bool) -> Iterator[Candidate]:
-    """Yield fits of the model with one further extension each, whose effect exceeds its limit."""
+    """Yield fits with one further term each, such as gravity, whose effect is not negligible."""
     model, means = fit.model, fit.means
     if is_first_round:
         yield from _axis_permutation_candidates(fit)
@@ -182,7 +182,7 @@ def _start_parameters_of_clock_rate_fit(fit: FittedModel, model: LoadModel, name
 
 
 def time_step_ratio_and_std(fit: FittedModel, name: str) -> tuple[float, float]:
-    """Return described / true time step and its standard deviation; (0, inf) if undefined."""
+    """Return stated over true time step, and its standard deviation; (0, inf) if undefined."""
     x, covariance = fit.parameters_of_extension(name)
     power, factor = CLOCK_RATE_EXPONENTS[name], 1.0 + float(x[0])
     if factor <= 0.0:
@@ -196,7 +196,7 @@ def has_negative_mass(fit: FittedModel) -> bool:
 
 
 def has_negative_inertia(fit: FittedModel) -> bool:
-    """Return True if the mass, or for a precise mass the inertia about So, is clearly negative."""
+    """Return True if the mass or, for a precise mass, a principal inertia at So is negative."""
     if fit.x[6] < _MIN_LOAD_MASS_OVER_DEVIATION * np.sqrt(fit.covariance[6, 6]):
         return has_negative_mass(fit)
     i, j = np.triu_indices(3)
@@ -244,7 +244,7 @@ def compare_gravity_with_description(fit: FittedModel) -> tuple[Array, float, fl
 
 
 def start_parameters_of_tilt_fit(fit: FittedModel) -> Array | None:
-    """Return start parameters with a linear estimate of gravity; None if no weight is measured."""
+    """Return start parameters with linearly estimated gravity; None if no weight is measured."""
     y = fit.means.with_only_used_rows(fit.rows.used).y
     sums = y.T @ y
     width = len(sums)
@@ -270,7 +270,7 @@ def start_parameters_of_tilt_fit(fit: FittedModel) -> Array | None:
 
 
 def drift_amplitudes(fit: FittedModel) -> Array:
-    """Return upper bounds (6,) of the offsets' drift about their means [N, N m]."""
+    """Return upper bounds (6,) of the drift of sensor offsets about their means [N, N m]."""
     name = "drift" if "drift" in fit.model.extensions else "linear drift"
     return np.abs(fit.parameters_of_extension(name)[0].reshape(6, -1)).sum(axis=1)
 
@@ -308,7 +308,7 @@ def _torque_factor_candidates(fit: FittedModel) -> Iterator[Candidate]:
 
 
 def fits_with_other_torque_units(fit: FittedModel) -> list[FittedModel]:
-    """Return fits, if nearly as likely, with unit factors of half to twice the torque factor."""
+    """Return fits, if nearly as likely, with a torque unit 0.5 to 2 times the fitted one."""
     factor, found = fit.model.torque_factor, []
     for other in TORQUE_UNIT_FACTORS if factor != 1.0 else ():
         if other != factor and 0.5 < other / factor < 2.0:

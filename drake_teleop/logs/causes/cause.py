@@ -28,13 +28,13 @@ CAUSES_DETERMINED_AT_REST = ("zero change", "drift", "contact")  # that a record
 
 @dataclass(frozen=True)
 class Finding:
-    """Suspicious property of a log, or cause why a rigid load does not explain its wrench.
+    """Suspicious property of a log, or reason why a rigid load does not explain its wrench.
 
     Attributes:
         name: category for programs, such as "units", "axes" or "load change".
         message: observation or cause, value with its interval, and remedy.
         start_s, stop_s: time span on the clock of the log [s]; None: unlimited.
-        values: figures by name, in SI; `angle_deg` in [deg].
+        values: numbers by name, in SI; `angle_deg` in [deg].
         fields: corrected values of fields of the log description, as in YAML.
     """
 
@@ -76,7 +76,7 @@ def list_misfit_causes(fit: FittedModel, always_fitted: tuple[str, ...] = ()) ->
 
 
 def loads_between_changes(fit: FittedModel, covariance: Array) -> list[RecordPartWithLoad]:
-    """Return the parts of a record between load changes, with their loads; [] without a change."""
+    """Return the parts of a record between load changes; [] without a change."""
     loads = [(s.time, i) for i, s in enumerate(fit.model.steps) if s.kind == "load"]
     if not loads:
         return []
@@ -152,7 +152,7 @@ def _cause_of_extension(fit: FittedModel, extension: str) -> Finding:
 
 
 def direction_std_deg(x: Array, covariance: Array) -> float:
-    """Return the largest standard deviation of the direction of a vector x (3,) [deg]."""
+    """Return the largest standard deviation [deg] of the direction of x (3,) with a covariance."""
     size = float(np.linalg.norm(x))
     across = np.eye(3) - np.outer(x, x) / size**2
     spread = float(np.linalg.eigvalsh(across @ covariance @ across)[-1])

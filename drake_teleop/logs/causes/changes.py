@@ -30,7 +30,7 @@ _MIN_MASS_STEP_OVER_MASS, _MIN_MOMENT_STEP_OVER_MASS_M = 0.01, 0.002
 
 
 def add_step_change(fit: FittedModel, kind: str) -> FittedModel | None:
-    """Return a fit with the likeliest change of "offsets" or "load"; None if insignificant."""
+    """Return a fit with the likeliest change of `kind` "offsets" or "load"; None: insignificant."""
     best: FittedModel | None = None
     for time in _likely_step_times_s(fit, kind):
         found = _fit_with_refined_step_time(fit, kind, time)
@@ -105,8 +105,8 @@ def fit_steps_at_middle_of_ramps(
 ) -> FittedModel:
     """Return a fit with more changes of "offsets" or "load", in the middle of gradual transitions.
 
-    `kinds` lists the changes at each of `times` [s]. Rows in the transitions, which take `widths`
-    [s], and in `contact_spans` are not used.
+    `kinds` lists the changes at each of `times` [s]. Rows within the transitions, with durations
+    `widths` [s], and in `contact_spans` are not used.
     """
     least = OMITTED_SPAN_AROUND_RAMP_S
     widths = [max(least, w + least) for w in (widths or [0.0] * len(times))]
@@ -210,7 +210,7 @@ _MAX_STEP_OVER_CONTACT_RESIDUAL, _SMALL_RESIDUAL_OVER_NOISE = 1.3, 1.25
 
 
 def find_contact_spans(fit: FittedModel) -> TimeSpans:
-    """Return time spans (start, stop) [s] of contact, whose residual far exceeds that elsewhere."""
+    """Return time spans (start, stop) [s] of contact, found by a much larger residual."""
     blocks = _NormalEquationsOfBlocks(fit)
     contact_blocks = blocks.find_contact_blocks(blocks.usable)
     if contact_blocks is None or not contact_blocks.any():
@@ -225,7 +225,7 @@ def find_contact_spans(fit: FittedModel) -> TimeSpans:
 
 
 def replace_contacts_by_steps(fit: FittedModel) -> FittedModel | None:
-    """Return a fit with step changes in place of contacts; None without any, or for a poor fit."""
+    """Return a fit with step changes in place of contacts; None without contacts or if poor."""
     blocks = _NormalEquationsOfBlocks(fit)
     left, number = blocks.usable.copy(), np.full(len(blocks.usable), -1)
     for load in range(_MAX_NUM_LOADS):
@@ -275,7 +275,7 @@ class _NormalEquationsOfBlocks:
         self._square = ((left @ sums) * left).sum(axis=(1, 2))
 
     def find_contact_blocks(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
-        """Flag blocks `among` with residuals above noise and motion errors; None for too few."""
+        """Flag blocks of contact within the flags `among`; None if these are too few."""
         found = self._fit_calmest_blocks(np.flatnonzero(among))
         if found is None:
             return None
@@ -356,7 +356,7 @@ def _block_residuals_due_to_motion_errors(
 
 
 def replace_steps_by_contact(fit: FittedModel) -> FittedModel:
-    """Replace step changes by a contact if they cancel, or if the residual after one is large."""
+    """Replace offset steps by a contact if two cancel, or if the residual beside one is large."""
     steps = sorted(enumerate(fit.model.steps), key=lambda x: x[1].time)
     first, last = float(fit.means.t[0]), float(fit.means.t[-1])
     borders = [(-1, first), *((i, step.time) for i, step in steps), (-1, last)]
@@ -380,7 +380,7 @@ def replace_steps_by_contact(fit: FittedModel) -> FittedModel:
 
 
 def shorten_contacts(fit: FittedModel) -> FittedModel:
-    """Return a fit whose contact spans are shortened to their rows with a large residual."""
+    """Return a fit with contact spans shortened to rows with a large residual."""
     means, spans = fit.means, []
     y = means.append_step_signals(fit.model.step_times)[:, fit.model.columns]
     usual = np.maximum(means.wrench_noise, fit.rows.residual_rms(fit.residual)).clip(1e-12)

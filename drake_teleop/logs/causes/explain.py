@@ -75,7 +75,7 @@ SearchResult = tuple[FittedModel, float, list[Candidate]]
 def search_causes(
     means: BlockMeans, means_at: MeansByDelay | None = None, always_fitted: tuple[str, ...] = ()
 ) -> SearchResult:
-    """Return the fit with the found causes, added motion delay [s], and rejected candidates."""
+    """Return the fit with the found causes, its additional motion delay [s], rejected causes."""
     plain = LoadModel(extensions=always_fitted)
     found = _search_causes_from(_fit_initial_model(means, plain), 0.0, means_at)
     if has_negative_mass(found[0]):
@@ -104,7 +104,7 @@ def _has_much_smaller_residual_than(fit: FittedModel, reference: FittedModel) ->
 
 
 def resembles_coloured_noise(fit: FittedModel) -> bool:
-    """Return True for a moderate residual that smooth signals do not explain."""
+    """Return True if the residual is moderate and smooth signals do not explain it."""
     small = fit.residual_ratio < _MAX_COLOURED_NOISE_RESIDUAL_RATIO
     return small and fit.smooth_misfit < GOOD_SMOOTH_MISFIT
 
@@ -220,11 +220,11 @@ class MisfitExplanation:
 
     Attributes:
         explained: True if the residual is sensor noise.
-        theta, covariance: [offsets; phi] (16,) of the first part of the record [SI]; (16, 16).
+        theta, covariance: [offsets; phi] (16,) before the first change [SI]; (16, 16).
         misfit_deviations: (16,) standard deviations of theta if the misfit is unexplained.
         delay_s: additional delay of the motion behind the wrench [s].
         loads: parts of the record with their loads; empty for one load.
-        always_fitted: names of extensions, such as "gravity", that are fitted but are no causes.
+        always_fitted: names of model terms, such as "gravity", that are no causes.
     """
 
     causes: tuple[Finding, ...]
@@ -250,7 +250,7 @@ class MisfitExplanation:
 
     @property
     def is_acceleration_missing(self) -> bool:
-        """True if the record lacks an acceleration whose force may cause the misfit."""
+        """True if an acceleration is missing whose inertial force may cause the misfit."""
         return not self.explained and bool(np.isinf(self.fit.means.acceleration_noise))
 
     @property
@@ -266,7 +266,7 @@ def explain_misfit(
 ) -> MisfitExplanation:
     """Test whether a rigid load explains a record, and search for causes if it does not.
 
-    The model contains the extensions `always_fitted`, such as "weight", from the start.
+    The model contains the terms `always_fitted`, such as "weight" (subtracted by the robot).
     `means_at(x)` returns the block means with an additional motion delay x [s].
     """
     with one_blas_thread():
@@ -292,10 +292,10 @@ def explain_misfit(
 
 
 def fit_with_missing_acceleration(misfit: MisfitExplanation) -> MisfitExplanation:
-    """Return the unweighted fit of a record without acceleration, with a pessimistic covariance.
+    """Return an explanation by a fit without acceleration, with a pessimistic covariance.
 
-    All residuals count as one common error, because the missing acceleration depends on the
-    orientation. The centre of rotation is unknown, hence the inertia is undetermined.
+    Samples do not average the error out, because the missing acceleration depends on the
+    orientation. The inertia is undetermined, because the centre of rotation is unknown.
     """
     means, axes = misfit.fit.means, misfit.fit.model.axes
     fits = []

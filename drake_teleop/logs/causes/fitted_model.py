@@ -20,7 +20,7 @@ TimeSpans = tuple[tuple[float, float], ...]  # (start, stop) of contacts [s]
 
 @dataclass(frozen=True, eq=False)
 class UsedRows:
-    """Rows of a record (`used` (M,) True) and signal columns to which a model is fitted."""
+    """Rows of a record (flags `used` (M,)) and signal columns to which a model is fitted."""
 
     means: BlockMeans
     used: NDArray[np.bool_]
@@ -34,7 +34,7 @@ class UsedRows:
 
     @cached_property
     def lagged_product_sums(self) -> Array:
-        """Sums (5, W, W) of y_i y_(i-d)^T for lags d of 0 to 4 rows, plus transpose if d > 0."""
+        """Sums (5, W, W) of products of W signals y_i y_(i-d)^T, lags d <= 4 rows; symmetrized."""
         return np.asarray(self.means.lagged_block_sums(self.y, rows=len(self.y))[0])
 
     @cached_property
@@ -53,7 +53,7 @@ class UsedRows:
         return np.asarray(y[at])
 
     def whitened_products(self, filters: Array) -> Array:
-        """Return sums of products (6, n, n) of n signals after whitening by the filters (6, 5)."""
+        """Return product sums (6, n, n) of n signals, whitened by each row of `filters` (6, 5)."""
         width = self.y.shape[1]
         taps = [(filters[:, : 5 - d] * filters[:, d:]).sum(axis=1) for d in range(5)]
         full = np.stack(taps, axis=1) @ self.lagged_product_sums.reshape(5, -1)
@@ -103,7 +103,7 @@ class FittedModel:
 
     Attributes:
         covariance: (size, size); huge for undetermined parameters.
-        residual: (6, k) coefficients; their product with a row of `rows.y` is the residual wrench.
+        residual: (6, k) coefficients; their product with k signals of a row is the residual wrench.
         noise_filters: (6, 5) that whiten the residual e: sum over d of filter[c, d] e_c[n - d].
         noise_power: (6,) variance of the whitened residual.
         contact_spans: (start, stop) of contacts, whose rows are not used [s].
@@ -184,7 +184,7 @@ class FittedModel:
 
     @cached_property
     def smooth_likelihood_gain(self) -> tuple[float, int]:
-        """Gain in twice the log likelihood by adding generic smooth signals, and their number."""
+        """Gain in twice the log likelihood by generic smooth signals, and number of parameters."""
         y = self.means.y
         segments = _NUM_TIME_SEGMENTS_OF_MISFIT_TEST
         part = np.linspace(0.0, segments, len(y), endpoint=False).astype(int)
@@ -257,7 +257,7 @@ def regularized_inverse(gram: Array) -> Array:
 
 
 def score_statistic(gram: Array, right: Array, min_diagonal: ArrayLike = 0.0) -> tuple[float, int]:
-    """Return right^T gram^-1 right, the gain in twice the log likelihood, and the rank of gram."""
+    """Return right^T gram^-1 right, the gain in twice the log likelihood, and rank of gram."""
     diagonal = np.diag(gram)
     used = diagonal > np.maximum(min_diagonal, 1e-12 * diagonal.max())
     if not used.any():

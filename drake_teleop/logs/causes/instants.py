@@ -1,6 +1,6 @@
 """Wrench and motion as block means at about 50 Hz, and sums of their products.
 
-All models of this package are linear in the signals of one instant,
+All models of this package are linear in 67 signals of one instant,
 
     y = [1, s, g, alpha, products of omega, F, dF/dt, R, R p, time],
 
@@ -47,14 +47,14 @@ class BlockMeans:
 
     Attributes:
         t: (M,) middle of each block [s].
-        y: (M, 67) signals of the module docstring; 0 in unused rows.
+        y: (M, 67) wrench and motion signals, see the module; 0 in unused rows.
         used: (M,) True for rows without gaps and edges.
         wrench_noise: (6,) standard deviation of white wrench noise in a block mean.
         gravity_W: (3,) gravity in the world [m/s^2], or None.
         acceleration_noise: standard deviation of acceleration noise in a block mean [m/s^2]; inf if
             the acceleration is unknown and taken as zero.
         alpha_noise_share: share of noise in the variance of an IMU's angular acceleration.
-        clock_rate: extension of `LoadModel` for a wrong rate of the clock, or None.
+        clock_rate: name of the model term for a wrong clock rate, or None.
     """
 
     t: Array
@@ -92,8 +92,7 @@ class BlockMeans:
     def append_step_signals(self, times: tuple[float, ...]) -> Array:
         """Return y (M, 67) with 25 columns appended for each step time [s].
 
-        These are the columns of the load's wrench and offsets, multiplied by 0 before and 1 after
-        the step.
+        These are the 25 signals of the load's wrench, times 0 before and 1 after the step.
         """
         parts = [self.y]
         for time in times:
@@ -102,7 +101,7 @@ class BlockMeans:
         return np.hstack(parts)
 
     def lagged_block_sums(self, y: Array, *, rows: int, lags: int = AR_ORDER + 1) -> Array:
-        """Return block sums (blocks, lags, W, W) of y_i y_(i-d)^T, plus transpose if lag d > 0."""
+        """Return block sums (blocks, lags, W, W) of products y_i y_(i-d)^T; symmetric."""
         width = y.shape[1]
         count = -(-len(y) // rows)
         padded = np.zeros((lags - 1 + count * rows, width))
@@ -128,7 +127,7 @@ def block_means_of_record(
     """Return block means of a record with N samples at equally spaced times `t` [s].
 
     The wrench (N, 6) is [f; tau] on the load, in S about So, Eq. (1). `gravity_W` is in the world
-    [m/s^2], None without orientation. Blocks with a `lost` sample are not used.
+    [m/s^2], None without orientation. Blocks with a missing (`lost`) sample are not used.
     """
     dt = float(t[-1] - t[0]) / (len(t) - 1)
     size = max(1, round(1.0 / (_INSTANT_RATE_HZ * dt)), -(-len(t) // _MAX_INSTANTS))
@@ -209,8 +208,8 @@ def _motion_signal_columns(motion: Sequence[Array], gravity_W: Array | None) -> 
 def delay_of_linear_fit(means: BlockMeans) -> float:
     """Return the motion delay behind the wrench [s] with the best linear fit.
 
-    The fit combines 16 motion signals freely, without a rigid load. The delay is within 0.25 s and
-    a tenth of the record; return 0 if it is at an end of this range.
+    The fit combines 16 motion signals freely, without a rigid load. The delay is limited to
+    0.25 s or a tenth of the record, the smaller; return 0 at an end of this range.
     """
     reach = min(_MAX_TRIED_DELAY_S, 0.1 * float(means.t[-1] - means.t[0]))
     rows = means.used & (means.t > means.t[0] + reach) & (means.t < means.t[-1] - reach)

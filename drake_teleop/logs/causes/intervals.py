@@ -44,7 +44,7 @@ def covariance_of_load(
 def deviations_of_load_if_unexplained(
     fit: FittedModel, rejected: Sequence[Candidate], jackknife_std: Array, gain_covariance: Array
 ) -> Array:
-    """Return jackknife standard deviations (16,) of [offsets; phi] with an unexplained misfit."""
+    """Return standard deviations (16,) of [offsets; phi], `jackknife_std` widened by a misfit."""
     large = fit.residual_ratio > _LARGE_RESIDUAL_RATIO
     limits = _MIN_SMOOTH_MISFIT_IF_SMALL_RESIDUAL, _MIN_SMOOTH_MISFIT_IF_LARGE_RESIDUAL
     if fit.smooth_misfit > limits[large]:

@@ -90,7 +90,7 @@ class LoadModel:
 
     @cached_property
     def columns(self) -> NDArray[np.intp]:
-        """Indices (k,) of the used signals among the columns of `append_step_signals`."""
+        """Indices (k,) of the used columns: 67 signals, then 25 for each step."""
         kept = np.ones(_step_change_columns(len(self.steps)).start, bool)
         if not {"gravity", "cable"} & set(self.extensions):
             kept[ROTATION_SIGNALS], kept[ROTATION_POSITION_PRODUCTS] = False, False
@@ -113,7 +113,7 @@ class LoadModel:
         return tuple(step.time for step in self.steps)
 
     def start_parameters(self, x: Array, other_model: LoadModel) -> Array:
-        """Return parameters (size,): values x of `other_model` where it has them, else 0."""
+        """Return parameters (size,): from x of `other_model` for shared terms, else 0."""
         out = np.zeros(self.size)
         out[: DELAY_INDEX + 1] = x[: DELAY_INDEX + 1]
         for name, where in self.parameter_slices.items():
@@ -122,7 +122,7 @@ class LoadModel:
         return out
 
     def wrench_coefficients(self, x: Array) -> Array:
-        """Return C (B, 6, W) for B parameters x (B, size): C times W signals is the wrench."""
+        """Return C (B, 6, W) for B parameter vectors (B, size): C times W signals is the wrench."""
         parts, motion = self.parameter_slices, self._motion_from_signals_matrix(x)
         out = np.zeros((len(x), 6, _step_change_columns(len(self.steps)).start))
         out[..., : instants.NUM_SIGNALS] = _wrench_coefficients_of_load(x[:, 6:16]) @ motion
@@ -182,7 +182,7 @@ class LoadModel:
         return M
 
     def wrench_jacobian(self, x: Array) -> Array:
-        """Return derivatives (size, 6, k) of `wrench_coefficients` of used signals by x (size,)."""
+        """Return derivatives (size, 6, k) of the wrench's coefficients of k used signals by x."""
         steps = np.ones(self.size)
         if "rotation" in self.parameter_slices:
             steps[self.parameter_slices["rotation"]] = _FINITE_DIFFERENCE_ROTATION_RAD

@@ -1,4 +1,4 @@
-"""Draft of a log description from names and magnitudes of columns (long: many spellings)."""
+"""Draft of a log description from names and magnitudes of columns."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ _Columns = dict[str, list[str]]  # names of the columns of each recognized vecto
 
 
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> Draft:
-    """Return a log description guessed from names and magnitudes of columns."""
+    """Return a log description guessed from a table, with paths relative to `folder`."""
     labels = {name: _normalized_name_and_unit(name) for name in table.columns}
     found = _find_euler_angles(labels) | _find_pose_vectors(table, labels) | _find_vectors(labels)
     found |= _find_numbered_or_array_vectors(table, labels) | _find_quaternion(table, labels)
@@ -207,7 +207,7 @@ def _find_numbered_or_array_vectors(table: Table, labels: _NamesAndUnits) -> _Co
 def _findings_on_other_wrenches(
     table: Table, labels: _NamesAndUnits, found: _Columns
 ) -> Iterator[Finding]:
-    """Yield a finding for each wrench in the table besides that in `found`."""
+    """Yield a finding for each wrench in the table besides the drafted one, `found`."""
     pair = "force", "torque"
     used = {x for names in found.values() for x in names}
     taken = ", ".join(x for kind in pair for x in found.get(kind, ()))
@@ -222,7 +222,7 @@ def _findings_on_other_wrenches(
         lines = " and ".join(f"wrench.{kind}.columns: {other[kind]}" for kind in pair)
         frame = "base" if re.search(_BASE_FORCE_PATTERN, labels[other["force"][0]][0]) else "sensor"
         text = f"the wrench is read from {taken}; another wrench is in {', '.join(sorted(used))}"
-        yield Finding("other wrench", f"{text}; to use it, set {lines} and wrench.frame: {frame}")
+        yield Finding("other wrench", f"{text}; to change, set {lines} and wrench.frame: {frame}")
 
 
 def _normalized_name_and_unit(name: str) -> tuple[str, str]:
@@ -263,7 +263,7 @@ def _find_vectors(labels: _NamesAndUnits) -> _Columns:
 
 
 def _group_by_vector(labels: _NamesAndUnits, kind: str, names: str) -> _Columns:
-    """Return the columns of each vector of a `kind` by prefix; complete ones if there are any."""
+    """Group x, y, z columns of a quantity `kind` by name prefix; prefer complete groups."""
     axes = "wxyz" if kind == "orientation" else "xyz"
     ends = rf"^(.*?)(?:(?:^|_)(?:{names}))_?([{axes}])$"
     groups: dict[str, dict[str, str]] = {}

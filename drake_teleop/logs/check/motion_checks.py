@@ -136,7 +136,7 @@ def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
 
 
 def _mean_specific_forces_in_start_axes(log: Log, gyro_axes: Array) -> Array:
-    """Return mean specific forces (2, n, 3) in n Hann windows, and in windows half a length later.
+    """Return mean specific forces (2, n, 3) in n Hann windows, then in windows half a length later.
 
     Integrated angular velocity, its axes permuted by `gyro_axes`, rotates them to the axes at the
     start of the window.
@@ -348,12 +348,12 @@ def _position_unit_finding(described: str, scale: float, deviation: float) -> Fi
     for unit in POSITION_UNITS:
         ratio = SI_VALUE_OF_UNIT[unit] / SI_VALUE_OF_UNIT[described]
         if unit != described and _UNIT_MATCH_RANGE[0] < scale / ratio < _UNIT_MATCH_RANGE[1]:
-            what = f"they are not in {described}; set pose.position.unit: {unit}"
+            what = f"the positions are not in {described}; set pose.position.unit: {unit}"
             return Finding("units", f"{text} {what}")
     if 1.0 / _MIN_UNIT_ERROR_FACTOR < abs(scale) < _MIN_UNIT_ERROR_FACTOR:  # noise or another error
         return None
     remedy = f"multiply pose.position.scale (1 by default) by {scale:.4g}"
-    return Finding("units", f"{text} their unit is unknown; {remedy}")
+    return Finding("units", f"{text} the unit of the positions is unknown; {remedy}")
 
 
 def _centred_fit_and_deviations(

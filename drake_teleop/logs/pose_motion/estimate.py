@@ -216,9 +216,9 @@ def _fit_pose_splines_and_delay(
     fewest = _MIN_SHARED_INSTANTS if free_load else _MIN_SHARED_INSTANTS_WITH_KNOWN_LOAD
     if usable < fewest:
         what = f"wrench and poses share {usable} instants, {grid.dt:.2g} s apart"
-        what += f" ({fewest} required; gaps of the poses above {_MIN_EXCLUDED_POSE_GAP_S} s and"
+        what += f" ({fewest} required, without pose gaps above {_MIN_EXCLUDED_POSE_GAP_S} s"
         remedy = "record both at the same time, longer, without interruptions, above 10 Hz"
-        raise DrakeTeleopError(f"{what} {_GAP_MARGIN_S} s beside them are excluded)", remedy=remedy)
+        raise DrakeTeleopError(f"{what} and {_GAP_MARGIN_S} s beside each gap)", remedy=remedy)
     slower = min(poses.rate, grid.stride / grid.dt)
     top = min(spectra.MAX_FREQUENCY_HZ, _MAX_FIT_FREQUENCY_OVER_SAMPLE_RATE * slower)
     whole = FitWindow(grid, taper, gravity, top)

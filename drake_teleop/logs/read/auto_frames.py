@@ -71,7 +71,7 @@ def _require_imu_rotation(mounting: Mounting | None, where: str) -> Mounting:
     else:
         return mounting
     what = f"the data do not determine the rotation of the IMU: {problem}"
-    raise DrakeTeleopError(what, where=where, remedy=f"{remedy}, or give a rotation matrix")
+    raise DrakeTeleopError(what, where=where, remedy=f"{remedy}, or set imu.frame")
 
 
 def _format_unexplained_shares(found: Mounting) -> str:
@@ -181,7 +181,7 @@ def block_means_of_log(log: Log) -> BlockMeans:
 
 
 def _clock_rate_extension_name(log: Log) -> str | None:
-    """Return the name of the model extension for a wrong clock rate; None if it is unknown."""
+    """Return the name of the model extension for a wrong clock rate; None: rate is correct."""
     if log.described is None or log.has_calendar_time or log.is_acceleration_unknown:
         return None
     imu = log.described.imu

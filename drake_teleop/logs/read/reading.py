@@ -1,4 +1,4 @@
-"""Conversion of a canonical table or a described recording into a `Log` (long: one class)."""
+"""Conversion of a canonical table or a described recording into a `Log`."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def check_path_and_cutoff(path: Any, cutoff_hz: Any, name: str = "cutoff_hz") ->
     expect_type((str, Path), path, "log", "give the file's name")
     if cutoff_hz is not None and not to_float(name, cutoff_hz) >= MIN_CUTOFF_HZ:
         remedy = f"give at least {MIN_CUTOFF_HZ:g} Hz, or None for no limit"
-        raise DrakeTeleopError(f"{cutoff_hz:g} Hz is too low", where=name, remedy=remedy)
+        raise DrakeTeleopError(f"cut-off {cutoff_hz:g} Hz is too low", where=name, remedy=remedy)
 
 
 def read_described_log(
@@ -331,7 +331,7 @@ class _LogReader:
                 raise DrakeTeleopError(what, where=f"{self.source}:{name}.time", remedy=remedy)
             if name == "wrench":
                 self.notes.append(
-                    f"{starts}: the episodes follow each other, 1 s or more apart; samples near"
+                    f"{starts}: episodes are joined 1 s or more apart; samples near"
                     " their ends are not used"
                 )
         if lengths.any():
