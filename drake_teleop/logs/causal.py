@@ -12,7 +12,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 
 _ROOT_OF_2, _FOURTH_ROOT_OF_3 = math.sqrt(2.0), 3.0**0.25
-CAUSAL_MODES = ("delayed", "predicted")
+CAUSAL_FILTER_MODES = ("delayed", "predicted")
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float
 
     Extrapolate the output over `ahead_s` [s] by its slope. A cut-off above Nyquist has no effect.
     """
-    low_pass = low_pass_and_settled_state(dt, cutoff_hz, ahead_s)
+    low_pass = low_pass_coefficients(dt, cutoff_hz, ahead_s)
     if not len(low_pass):
         return x
     from scipy.signal import lfilter
@@ -48,7 +48,7 @@ def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float
     return lfilter(b, a, x, axis=0, zi=at_first)[0]
 
 
-def low_pass_and_settled_state(dt: float, cutoff_hz: float | None, ahead_s: float = 0.0) -> Array:
+def low_pass_coefficients(dt: float, cutoff_hz: float | None, ahead_s: float = 0.0) -> Array:
     """Return filter coefficients and steady state (7,); (0,) if the filter has no effect."""
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         if ahead_s != 0.0:
@@ -80,7 +80,7 @@ def design_low_pass(dt, tangent, ahead_s, low_pass):
     low_pass[5] = low_pass[6] + low_pass[1] - low_pass[3]
 
 
-def filter_lag(dt: float, cutoff_hz: float | None) -> float:
+def low_pass_delay_s(dt: float, cutoff_hz: float | None) -> float:
     """Return the delay [s] of `causal_low_pass` at low frequencies, without extrapolation."""
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         return 0.0
@@ -95,11 +95,11 @@ def compute_causal_wrench(
     `delay_s`, the motion's delay behind the wrench, is rounded up to full samples. Mode "delayed"
     does not correct the lag; "predicted" extrapolates over it.
     """
-    if mode not in CAUSAL_MODES:
+    if mode not in CAUSAL_FILTER_MODES:
         what = f"{mode!r} is not a causal mode"
-        raise DrakeTeleopError(what, where="causal", remedy=f"give one of {CAUSAL_MODES}")
+        raise DrakeTeleopError(what, where="causal", remedy=f"give one of {CAUSAL_FILTER_MODES}")
     wait = max(0, math.ceil(delay_s / dt - 1e-6))
-    lag = wait * dt + filter_lag(dt, cutoff_hz)
+    lag = wait * dt + low_pass_delay_s(dt, cutoff_hz)
     ahead = lag if mode == "predicted" else 0.0
 
     def filter_and_delay(wrench: Array) -> Array:

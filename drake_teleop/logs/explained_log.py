@@ -48,11 +48,11 @@ _REMEDY_OF_CAUSE_WITHOUT_FIELD = {
 }
 
 
-def add_description_lines(
+def add_corrected_fields(
     causes: Sequence[Finding], log: Log, *, by_pose: bool
 ) -> tuple[Finding, ...]:
     """Return the causes with corrected description lines; `by_pose`: poses determine the motion."""
-    fields, changed_names = _corrected_fields_and_names_by_cause(causes, log, by_pose)
+    fields, changed_names = _corrected_fields_and_changed_names(causes, log, by_pose)
     note, out = note_that_table_needs_description(log.source), []
     for cause, names in zip(causes, changed_names, strict=True):
         lines = {name: _yaml_value(name, fields[name]) for name in names}
@@ -68,7 +68,7 @@ def implausible_mass_message(mass: float, causes: Sequence[Finding], log: Log) -
     """Return a message on units for a mass of 1000 kg or more and a described wrench, else None."""
     if abs(mass) < MAX_PLAUSIBLE_MASS_KG or log.described is None or log.described.wrench is None:
         return None
-    fields = _corrected_fields_and_names_by_cause(causes, log, by_pose=True)[0]
+    fields = _corrected_fields_and_changed_names(causes, log, by_pose=True)[0]
     force, torque = fields["wrench.force.scale"], fields["wrench.torque.scale"]
     likely = force * 10.0 ** -round(np.log10(abs(mass)))
     return (
@@ -81,7 +81,7 @@ def implausible_mass_message(mass: float, causes: Sequence[Finding], log: Log) -
     )
 
 
-def _corrected_fields_and_names_by_cause(
+def _corrected_fields_and_changed_names(
     causes: Sequence[Finding], log: Log, by_pose: bool
 ) -> tuple[DescriptionFields, list[list[str]]]:
     assert log.described is not None
@@ -200,7 +200,7 @@ def _correct_wrench_unit_or_torque_scale(fields: DescriptionFields, torque_facto
 _SPLINE_END_MARGIN_OVER_KNOT_SPACING = 2.0  # knots, at either end
 _MIN_BLOCK_MEANS_TO_EXPLAIN, _BLOCK_MEAN_BANDWIDTH_HZ = 50, 25.0
 _MAX_GYROSCOPE_GAIN_ERROR = 0.005
-_MIN_WIDENING_STD_RATIO = 1.5  # ratio of block to stated deviations that widens the intervals
+_MIN_STD_RATIO_TO_WIDEN = 1.5  # ratio of block to stated deviations that widens the intervals
 
 
 def explain_log(log: Log, delay_s: float, motion: PoseEstimate | None) -> MisfitExplanation | None:
@@ -228,7 +228,7 @@ def explain_log(log: Log, delay_s: float, motion: PoseEstimate | None) -> Misfit
     misfit = fit_with_missing_acceleration(misfit) if misfit.is_acceleration_missing else misfit
     if log.described is None:
         return misfit
-    return replace(misfit, causes=add_description_lines(misfit.causes, log, by_pose=bool(motion)))
+    return replace(misfit, causes=add_corrected_fields(misfit.causes, log, by_pose=bool(motion)))
 
 
 def _block_means_of_splines(log: Log, motion: PoseEstimate, delay_s: float) -> BlockMeans:
@@ -278,7 +278,7 @@ def apply_explanation_to_load(load: Identification, misfit: MisfitExplanation) -
         stated = np.sqrt(np.diag(load.covariance))
         ratio = np.maximum(1.0, misfit.misfit_deviations / np.maximum(stated, 1e-300))
         ratio = np.where(load.identifiable, ratio, 1.0)
-        if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) >= _MIN_WIDENING_STD_RATIO:
+        if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) >= _MIN_STD_RATIO_TO_WIDEN:
             factors = np.where(np.eye(16) > 0, ratio**2, np.outer(ratio, ratio))
             load = _replace_covariance_of_load(load, load.covariance * factors)
     if misfit.fit.means.gravity_W is not None:
@@ -324,7 +324,7 @@ def _replace_load_by_causes_fit(load: Identification, misfit: MisfitExplanation)
     )
 
 
-def replace_frame_causes(misfit: MisfitExplanation, finding: Finding) -> tuple[Finding, ...]:
+def use_pose_frame_finding(misfit: MisfitExplanation, finding: Finding) -> tuple[Finding, ...]:
     """Return the causes; `finding` replaces frame and rotation if only these are extensions."""
     if misfit.fit.model.extensions and set(misfit.fit.model.extensions) <= {"frame", "rotation"}:
         kept = [x for x in misfit.causes if x.name not in ("pose frame", "sensor rotation")]
@@ -338,11 +338,11 @@ def misfit_finding(misfit: MisfitExplanation, corrections: Sequence[Finding]) ->
     text = f"the residual is up to {ratio:.0f} times the sensor's noise"
     remedy = "record without contact, with the same load throughout and with loose cables"
     if corrections:
-        return Finding("misfit", f"{text}, and {correction_question(corrections[0])}; or {remedy}")
+        return Finding("misfit", f"{text}, and {check_request(corrections[0])}; or {remedy}")
     return Finding("misfit", f"{text}, and no known cause explains it; {remedy}")
 
 
-def correction_question(correction: Finding) -> str:
+def check_request(correction: Finding) -> str:
     """Return the request to check the likeliest correction of an unexplained record."""
     text = correction.message.partition("; set ")[0].partition("; correct ")[0]
     return f"no single correction explains the record; check whether {text}"

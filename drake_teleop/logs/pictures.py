@@ -151,7 +151,7 @@ def _draw_parameter_intervals(figure: Any, result: Identification) -> None:
 def draw_elimination(found: EliminatedLog) -> Figure:
     """Draw force magnitude and the six channels of each wrench; shade contacts."""
     curves = [("measured, offsets removed", found.measured, _MEASURED_CURVE_COLOUR)]
-    curves += _curves_without_static_weight(found)
+    curves += _curve_without_static_weight(found)
     if found.causal is not None:
         curves.append((f"contact, causal ({found.causal.mode})", found.causal.contact, PURPLE))
     curves.append(("contact wrench", found.contact, BLUE))
@@ -177,7 +177,7 @@ def draw_elimination(found: EliminatedLog) -> Figure:
     return figure
 
 
-def _curves_without_static_weight(found: EliminatedLog) -> _Curves:
+def _curve_without_static_weight(found: EliminatedLog) -> _Curves:
     weightless = found.gravity_only
     return [] if weightless is None else [("static weight removed", weightless, ORANGE)]
 
@@ -193,7 +193,7 @@ def draw_detection(found: DetectedLog) -> Any:
         raw = eliminated.measured - eliminated.measured[0]
         for name, wrench, colour in (
             ("measured, tared at the start", raw, _MEASURED_CURVE_COLOUR),
-            *_curves_without_static_weight(eliminated),
+            *_curve_without_static_weight(eliminated),
             ("contact", eliminated.contact, BLUE),
         ):
             top.plot(t, np.linalg.norm(wrench[inner, :3], axis=1), color=colour, label=name)

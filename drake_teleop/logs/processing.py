@@ -30,7 +30,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs import aligned_log, explained_log
 from drake_teleop.logs import contact as contacts
-from drake_teleop.logs.aligned_log import METHODS_WITH_SPLINES, LoadFitOfLog, read_aligned_log
+from drake_teleop.logs.aligned_log import SPLINE_METHOD_NAMES, LoadFitOfLog, read_aligned_log
 from drake_teleop.logs.causal import CausalContactAndScaledWrench, compute_causal_wrench
 from drake_teleop.logs.causes.cause import (
     CAUSES_DETERMINED_AT_REST,
@@ -230,7 +230,7 @@ def identify_log(
 def _read_and_fit_load(
     path: str | Path, method: str, cutoff_hz: float | None, delay: str | float
 ) -> tuple[Log, LoadFitOfLog, tuple[Finding, ...]]:
-    log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in METHODS_WITH_SPLINES)
+    log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in SPLINE_METHOD_NAMES)
     fitted, frame_findings = aligned_log.fit_load_to_posed_log(log, method, cutoff_hz, delay)
     if fitted is None and log.posed is not None and log.posed.imu is None:  # too short for splines
         log = read_log(path, bandwidth_hz=cutoff_hz)
@@ -352,7 +352,7 @@ def _apply_explanation(
 ) -> tuple[Identification, tuple[Finding, ...], str]:
     causes = misfit.causes
     if frame_findings:
-        causes = explained_log.replace_frame_causes(misfit, frame_findings[0])
+        causes = explained_log.use_pose_frame_finding(misfit, frame_findings[0])
     if raw.estimated:
         note = explained_log.removed_weight_note(misfit)
     elif causes and not misfit.needs_crosstalk_calibration:
@@ -517,10 +517,10 @@ def eliminate_log(
     if untouched_s is not None and not tare:
         what = "a contact-free span cannot be combined with --offsets load (tare=False)"
         raise DrakeTeleopError(what, where="untouched", remedy="remove one of the two")
-    found = _read_and_eliminate_log(path, *common, untouched_s, causal, causal_tare_s)
+    found = _read_log_and_remove_load(path, *common, untouched_s, causal, causal_tare_s)
     reference = None
     if free is not None:
-        free_log = _read_and_eliminate_log(free, *common)
+        free_log = _read_log_and_remove_load(free, *common)
         _reject_static_log(free_log)
         _reject_static_log(found)
         free_samples = contacts.samples_for_detector(free_log.log, free_log.contact, cutoff_hz)
@@ -549,7 +549,7 @@ def _reject_static_log(found: EliminatedLog) -> None:
         )
 
 
-def _read_and_eliminate_log(
+def _read_log_and_remove_load(
     path: str | Path,
     identification: Identification,
     phi_gripper: Array,
@@ -600,7 +600,7 @@ def _read_and_eliminate_log(
     sigmas = {name: scales[name] for name in scales if name not in ("gamma", "gravity")}
     weights, inertias = compensation.weight_scales_and_inertia_scales(**sigmas)
     if weights != inertias and removed:
-        raise weight_scale_without_effect_error(log.source)
+        raise useless_weight_scale_error(log.source)
     if weights != inertias and log.gravity is None:
         where = f"{log.source}: gravity in the sensor frame"
         raise compensation.unknown_gravity_error(where, "add an orientation, or omit sigma_weight")
@@ -705,7 +705,7 @@ def _check_log_if_contact_is_large(
     return tuple(x for x in check_log(path).findings if x.name not in ignored)
 
 
-def weight_scale_without_effect_error(where: str) -> DrakeTeleopError:
+def useless_weight_scale_error(where: str) -> DrakeTeleopError:
     what = "the robot has removed the weight, so that sigma_weight has no effect"
     return DrakeTeleopError(what, where=where, remedy="omit sigma_weight; sigma scales the inertia")
 

@@ -134,9 +134,9 @@ def _fit_with_extension(fit: FittedModel, name: str) -> Iterator[Candidate]:
         yield _scored_candidate(name, fit, best)
 
 
-def _is_extension_effect_significant(fit: FittedModel, name: str) -> bool:
-    x, _ = fit.parameters_of_extension(name)
-    match name:
+def _is_extension_effect_significant(fit: FittedModel, extension: str) -> bool:
+    x, _ = fit.parameters_of_extension(extension)
+    match extension:
         case "gravity":
             _, angle, ratio = compare_gravity_with_description(fit)
             error = abs(ratio - 1.0)
@@ -150,8 +150,8 @@ def _is_extension_effect_significant(fit: FittedModel, name: str) -> bool:
             return bool(x[0] > _MIN_REMOVED_MASS_SHARE * mass or arm > _MIN_REMOVED_MOMENT_ARM_M)
         case "frame":
             return bool(np.linalg.norm(x) > _MIN_POSE_SHIFT_M)
-        case _ if name in CLOCK_RATE_EXPONENTS:
-            ratio, deviation = time_step_ratio_and_std(fit, name)
+        case _ if extension in CLOCK_RATE_EXPONENTS:
+            ratio, deviation = time_step_ratio_and_std(fit, extension)
             # Without any weight in the wrench the ratio of poses is infinite.
             precise = deviation < _MAX_CLOCK_RATE_STD_OVER_ERROR * abs(ratio - 1.0)
             return bool(precise and abs(ratio - 1.0) > _MIN_CLOCK_RATE_ERROR)
@@ -181,10 +181,10 @@ def _start_parameters_of_clock_rate_fit(fit: FittedModel, model: LoadModel, name
     return x
 
 
-def time_step_ratio_and_std(fit: FittedModel, name: str) -> tuple[float, float]:
+def time_step_ratio_and_std(fit: FittedModel, extension: str) -> tuple[float, float]:
     """Return stated over true time step, and its standard deviation; (0, inf) if undefined."""
-    x, covariance = fit.parameters_of_extension(name)
-    power, factor = CLOCK_RATE_EXPONENTS[name], 1.0 + float(x[0])
+    x, covariance = fit.parameters_of_extension(extension)
+    power, factor = CLOCK_RATE_EXPONENTS[extension], 1.0 + float(x[0])
     if factor <= 0.0:
         return 0.0, np.inf
     ratio = factor ** (1.0 / power)

@@ -208,9 +208,9 @@ def _torque_factor_cause(fit: FittedModel) -> Finding:
     return Finding("torque factor", f"{what}: a unit or sign is wrong", values={"factor": factor})
 
 
-def _gain_error_cause(fit: FittedModel, c: int) -> Finding:
-    value, covariance = fit.parameters_of_extension(f"gain {c}")
-    channel, wide = CHANNEL_NAMES[c], 1.96 * float(np.sqrt(covariance[0, 0]))
+def _gain_error_cause(fit: FittedModel, channel_index: int) -> Finding:
+    value, covariance = fit.parameters_of_extension(f"gain {channel_index}")
+    channel, wide = CHANNEL_NAMES[channel_index], 1.96 * float(np.sqrt(covariance[0, 0]))
     text = (
         f"{channel} reads {100 * value[0]:.2f} % (+- {100 * wide:.2g}) more than expected from the"
         " other channels; calibrate the sensor"

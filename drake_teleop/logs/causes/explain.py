@@ -154,10 +154,10 @@ def _search_causes_from(
     return fit, delay_s, rejected
 
 
-def _drop_cable_if_removed_weight_explains_it(found: list[Candidate]) -> list[Candidate]:
-    weights = (x for x in found if x.name == "weight" and not candidates.is_fit_plausible(x.fit))
+def _drop_cable_if_removed_weight_explains_it(tried: list[Candidate]) -> list[Candidate]:
+    weights = (x for x in tried if x.name == "weight" and not candidates.is_fit_plausible(x.fit))
     best = max((x.score for x in weights), default=0)
-    return [x for x in found if x.name != "cable" or best < _MIN_WEIGHT_OVER_CABLE_SCORE * x.score]
+    return [x for x in tried if x.name != "cable" or best < _MIN_WEIGHT_OVER_CABLE_SCORE * x.score]
 
 
 def _refit_with_shifted_motion(

@@ -41,7 +41,7 @@ MAX_GOOD_RESIDUAL_SHARE = 0.02
 """Largest unexplained share of the variance, without white noise, of a good fit."""
 MAX_VALID_RESIDUAL_SHARE = 0.05
 """Largest unexplained share of the variance, without white noise, of a valid description."""
-MIN_MISFIT_REDUCTION_BY_EDIT = 4.0  # least factor on the unexplained share
+MIN_MISFIT_REDUCTION_FACTOR = 4.0  # least factor on the unexplained share
 _FALSE_ALARM_RATE, _NUM_TESTED_EDITS = 1e-6, 50
 _FINDINGS_WITHOUT_WRENCH_SIGN_EDIT = ("sign", "swapped axes")
 """Sign, and axes: with the opposite sign they are mirrored, a cause that `identify` reports."""
@@ -60,17 +60,17 @@ class LoadFitQuality:
 
     @property
     def is_good(self) -> bool:
-        limit = self.max_unexplained_including_noise(MAX_GOOD_RESIDUAL_SHARE)
+        limit = self.max_residual_share_including_noise(MAX_GOOD_RESIDUAL_SHARE)
         return self.mass > 0 and self.unexplained < limit
 
-    def max_unexplained_including_noise(self, limit_without_noise: float) -> float:
+    def max_residual_share_including_noise(self, limit_without_noise: float) -> float:
         """Return the limit of `unexplained`: `limit_without_noise` plus noise, at most 0.9."""
         return min(limit_without_noise + self.noise_share, MIN_RESIDUAL_SHARE_OF_UNKNOWN_LOAD)
 
 
 def fit_load(log: Log, kept_share: float = 1.0) -> LoadFitQuality:
     """Fit a load to the best `kept_share` of samples of a low-passed log; return the quality."""
-    return _fit_load_to_samples(_low_pass_and_thin_log(log), kept_share)
+    return _fit_load_to_samples(_low_pass_and_decimate_log(log), kept_share)
 
 
 class _LowPassedSamples(NamedTuple):
@@ -83,7 +83,7 @@ class _LowPassedSamples(NamedTuple):
     wrench_noise: Array
 
 
-def _low_pass_and_thin_log(log: Log) -> _LowPassedSamples:
+def _low_pass_and_decimate_log(log: Log) -> _LowPassedSamples:
     limit = max_cutoff_by_pose_noise(log)
     cutoff = None if log.static else min(_LOAD_FIT_CUTOFF_HZ, 0.2 / log.dt, limit)
     smooth = low_pass_log(log, cutoff).select_rows(is_far_from_gaps(log, cutoff))
@@ -153,7 +153,7 @@ MIN_REPORTED_LAG_S = 0.002
 _NUM_DELAY_PARTS, _MIN_DELAY_PARTS = 8, 4
 _MIN_DELAY_DRIFT_S, _MAX_DELAY_DEVIATION_OVER_DRIFT = 0.03, 0.15
 """Smallest change of the delay [s]; largest deviation from a line, as a share of it."""
-_MAX_UNEXPLAINED_RATIO_AFTER_CORRECTION = 0.5
+_MAX_RESIDUAL_RATIO_AFTER_CORRECTION = 0.5
 
 
 def check_wrench_and_estimate_delay(
@@ -177,7 +177,7 @@ def check_wrench_and_estimate_delay(
             if edited is not description and why is not None:
                 raise DrakeTeleopError(why)
             aligned = [remove_delay(log, shift) for shift in {0.0, delay or 0.0}]
-            samples_of_edits[id(edited)] = [_low_pass_and_thin_log(each) for each in aligned]
+            samples_of_edits[id(edited)] = [_low_pass_and_decimate_log(each) for each in aligned]
         fits = [_fit_load_to_samples(each, kept_share) for each in samples_of_edits[id(edited)]]
         return min(fits, key=lambda fit: fit.unexplained)
 
@@ -229,10 +229,10 @@ def _select_far_better_edits(
         elif finding is None:  # a clock and the sign
             negative.append((fit, *next(edits.wrench_and_motion_edits(edited))))
     # A negative mass is impossible: an equally good fit with a positive one suffices.
-    valid = given.max_unexplained_including_noise(MAX_VALID_RESIDUAL_SHARE)
+    valid = given.max_residual_share_including_noise(MAX_VALID_RESIDUAL_SHARE)
     n = max(1.0, given.independent_samples)
     least_factor = float(fdtri(n, n, 1 - _FALSE_ALARM_RATE / _NUM_TESTED_EDITS))
-    decisive = given.unexplained / max(MIN_MISFIT_REDUCTION_BY_EDIT, least_factor)
+    decisive = given.unexplained / max(MIN_MISFIT_REDUCTION_FACTOR, least_factor)
     limit = min(1.01 * given.unexplained if given.mass < 0 else decisive, valid)
     found = [entry for entry in positive if entry[0].unexplained < limit]
     return found or [entry for entry in negative if entry[0].unexplained < min(decisive, valid)]
@@ -350,8 +350,8 @@ def clock_drift_finding_and_correction(
     if line is None:
         return [], description
     late, slope = line
-    _, lines, edited = data.start_lag_and_clock_drift_correction(name, description, late, slope)
-    limit = _MAX_UNEXPLAINED_RATIO_AFTER_CORRECTION * _unexplained_share_after_delay_removal(log)
+    _, lines, edited = data.correction_of_lag_and_clock_drift(name, description, late, slope)
+    limit = _MAX_RESIDUAL_RATIO_AFTER_CORRECTION * _unexplained_share_after_delay_removal(log)
     if _unexplained_share_after_delay_removal(data.read_thinned_log(edited)) > limit:
         return [], description
     text = f"the clock of the {name} drifts by {1e3 * slope:.3g} ms per second against the wrench's"

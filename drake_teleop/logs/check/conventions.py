@@ -33,7 +33,7 @@ from drake_teleop.logs.read.table_files import TABLE_READERS
 from drake_teleop.logs.read.tables import Table
 
 _MIN_STATIC_POSES_FOR_CHECK = 6
-_MIN_GRAVITY_DIRECTION_STD = 0.15  # that separates offsets from a load
+_MIN_GRAVITY_DIRECTION_STD_RAD = 0.15  # that separates offsets from a load
 _MIN_WRENCH_RANGE_OVER_MAGNITUDE = 1e-6  # of a live wrench, over the largest reading
 
 
@@ -200,7 +200,7 @@ def _static_pose_findings(log: Log) -> list[Finding]:
     size = np.linalg.norm(log.specific_force, axis=1, keepdims=True)
     up = log.specific_force / np.maximum(size, 1e-9)
     least = float(np.linalg.svd(up - up.mean(axis=0), compute_uv=False)[-1]) / np.sqrt(len(up))
-    if least >= _MIN_GRAVITY_DIRECTION_STD:
+    if least >= _MIN_GRAVITY_DIRECTION_STD_RAD:
         return []
     text = (
         "the poses are too alike: along one direction gravity in S varies by only"
@@ -210,8 +210,8 @@ def _static_pose_findings(log: Log) -> list[Finding]:
     return [Finding("static poses", text)]
 
 
-_WRENCH_FIELDS = ("force", "torque")
-_IMU_FIELDS = ("specific_force", "angular_velocity", "angular_acceleration")
+_WRENCH_QUANTITIES = ("force", "torque")
+_IMU_QUANTITIES = ("specific_force", "angular_velocity", "angular_acceleration")
 _MIN_LIVE_CHANNEL_NOISE_OVER_RANGE = 1e-6
 
 
@@ -224,7 +224,7 @@ def _dead_or_repeated_channel_findings(
     if described is None:
         return found
     table = tables[described.source].rows_with_any_number(described.columns)
-    for field in _WRENCH_FIELDS if stream == "wrench" else _IMU_FIELDS:
+    for field in _WRENCH_QUANTITIES if stream == "wrench" else _IMU_QUANTITIES:
         quantity = getattr(described, field, None)
         if quantity is None:
             continue

@@ -205,7 +205,7 @@ class LogTables:
         description = description.model_copy(update=stamped)
         return read_described_log(description, self._source, tables=self._thinned)
 
-    def start_lag_and_clock_drift_correction(
+    def correction_of_lag_and_clock_drift(
         self, name: str, description: Description, lag_at_wrench_start_s: float, drift: float
     ) -> tuple[float, str, Description]:
         """Return a stream's lag at its first row [s], YAML text of the fix, corrected description.

@@ -32,10 +32,10 @@ _GROUP_EDGES_HZ = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0
 _MIN_FREQUENCIES_PER_NOISE_GROUP = 8.0
 # Largest ratio of the ends of a band below this frequency [Hz].
 _MAX_NARROW_BAND_FREQUENCY_HZ, _MAX_NARROW_BAND_EDGE_RATIO = 3.0, 4.0 / 3.0
-NUM_MOMENT_SIGNALS = 2 * NUM_MOTION_SIGNALS + 6
+NUM_SPECTRAL_COLUMNS = 2 * NUM_MOTION_SIGNALS + 6
 # Columns of the wrench and of the signals' derivatives in `second_moments`.
 WRENCH_COLUMNS = slice(NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS + 6)
-SIGNAL_RATE_COLUMNS = slice(NUM_MOTION_SIGNALS + 6, NUM_MOMENT_SIGNALS)
+SIGNAL_RATE_SLICE = slice(NUM_MOTION_SIGNALS + 6, NUM_SPECTRAL_COLUMNS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,7 +289,7 @@ class NoiseLevels:
     relative_power: Array
 
     @classmethod
-    def white_within_groups(cls, bands: FrequencyBands) -> NoiseLevels:
+    def white_noise_in_each_group(cls, bands: FrequencyBands) -> NoiseLevels:
         return cls(bands.half_dof_of_bands, bands.group_of_band, np.ones((bands.num_bands, 6)))
 
     def noise_power(self, sums: Array, used: Array | None = None) -> Array:
@@ -328,7 +328,7 @@ OMEGA_PRODUCT_COLUMNS = np.array([[10, 13, 14], [13, 11, 15], [14, 15, 12]])
 _ACCELERATION_COLUMNS, _GRAVITY_COLUMNS, _ALPHA_COLUMNS = slice(1, 4), slice(4, 7), slice(7, 10)
 
 
-def noise_moments(splines: PoseSplines, spectra: Spectra, noise: tuple[float, float]) -> Array:
+def pose_noise_moments(splines: PoseSplines, spectra: Spectra, noise: tuple[float, float]) -> Array:
     """Return the part (bands, 38, 38) of `Spectra.second_moments_with_rates` by noise of the poses.
 
     `noise`: standard deviations of position [m] and rotation [rad].
@@ -344,8 +344,8 @@ def noise_moments(splines: PoseSplines, spectra: Spectra, noise: tuple[float, fl
     weight = taper**2 / np.sum(taper**2)
     shapes = _signal_covariances_by_unit_pose_noise(spectra.motion_signals, weight)
     powers = position_power * w2**2, rotation_power, rotation_power * w2, rotation_power * w2**2
-    Q = np.zeros((bands.num_bands, NUM_MOMENT_SIGNALS, NUM_MOMENT_SIGNALS))
-    signals, rates = slice(0, NUM_MOTION_SIGNALS), SIGNAL_RATE_COLUMNS
+    Q = np.zeros((bands.num_bands, NUM_SPECTRAL_COLUMNS, NUM_SPECTRAL_COLUMNS))
+    signals, rates = slice(0, NUM_MOTION_SIGNALS), SIGNAL_RATE_SLICE
     for power, shape in zip(powers, shapes, strict=True):
         Q[:, signals, signals] += bands.sums_over_bands(power)[:, None, None] * shape
         Q[:, rates, rates] += bands.sums_over_bands(power * w2)[:, None, None] * shape

@@ -151,7 +151,7 @@ def join_episodes(t: Array) -> tuple[Array, int]:
     return result, len(back) + 1
 
 
-def zero_steps_between_episodes(steps: Array, median_step: float, num_episodes: int) -> Array:
+def set_episode_steps_to_zero(steps: Array, median_step: float, num_episodes: int) -> Array:
     error, inner = np.abs(steps - max(EPISODE_SPACING_S, 10.0 * median_step)), steps.copy()
     inner[np.argsort(error, kind="stable")[: num_episodes - 1]] = 0.0
     return inner

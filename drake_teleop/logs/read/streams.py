@@ -108,7 +108,7 @@ class OrientationColumns:
         """Return R_WS or R_WP (n, 3, 3) of n rows; raise an error if these are no rotations."""
         orientation = self._orientation
         R = rotations.rotation_matrices(self._columns[rows], orientation.form, orientation.axes)
-        self._check_rotation_errors(rotations.orthogonality_error(R), rows)
+        self._check_orthogonality_errors(rotations.orthogonality_error(R), rows)
         return rotations.nearest_rotation(np.swapaxes(R, 1, 2) if orientation.inverse else R)
 
     def quaternions(self, rows: NDArray[np.intp]) -> Array:
@@ -119,13 +119,13 @@ class OrientationColumns:
         if self._orientation.form == "quaternion_xyzw":
             q = np.roll(q, 1, axis=1)
         squared = np.einsum("ij,ij->i", q, q)  # the matrix of q is this, times a rotation
-        self._check_rotation_errors(np.abs(squared**2 - 1.0), rows)
+        self._check_orthogonality_errors(np.abs(squared**2 - 1.0), rows)
         q /= np.sqrt(squared)[:, None]
         if self._orientation.inverse:
             q[:, 1:] *= -1.0
         return q
 
-    def _check_rotation_errors(self, errors: Array, rows: NDArray[np.intp]) -> None:
+    def _check_orthogonality_errors(self, errors: Array, rows: NDArray[np.intp]) -> None:
         worst = int(np.argmax(errors))
         if errors[worst] > ROTATION_TOLERANCE:
             row = self._table.line_in_file(rows[worst])
