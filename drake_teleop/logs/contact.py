@@ -44,8 +44,8 @@ class Detection:
 
     Attributes:
         noise_floor: noise of the contact wrench in free motion.
-        statistic, threshold: name of the used statistic, and its threshold.
-        statistics: (N, 3) values of all statistics; 0 in samples that are not judged.
+        statistic, threshold: name of the used statistic, and its limit.
+        statistics: (N, 3) level, cusum, glr; 0 in samples near ends and edges.
         touched: (N,) True for contact, with hysteresis.
         free_duration_s: duration of the free motion that determined the noise floor [s].
         force_threshold: 1.25 times the largest |F_c| of the free motion [N].
@@ -62,7 +62,7 @@ class Detection:
 
     @property
     def is_above_threshold(self) -> NDArray[np.bool_]:
-        """Booleans (N,): True where the statistic reaches the threshold, without hysteresis."""
+        """Flags (N,): True where the statistic reaches the threshold, without hysteresis."""
         return self.statistics[:, statistic_index(self.statistic)] >= self.threshold
 
 
@@ -86,7 +86,7 @@ def detect_contact(
     free: tuple[DetectorSamples, float] | None = None,
     statistic: str = "level",
 ) -> Detection | None:
-    """Find contact in a log; return None for fewer than 100 judged samples.
+    """Find contact in samples of a log; return None if too few are away from ends and edges.
 
     Samples with `edge` True, or within a period of the low-pass from the ends, are not judged.
     `covariance` (16, 16) is that of [offsets; phi], `residual_rms` (6,) that of the identification
@@ -234,7 +234,7 @@ def _notes_if_mostly_contact(
 
 
 def note_on_drift_or_much_contact(shift: Array, found: Detection) -> tuple[str, ...]:
-    """Return a note if contact is frequent and offsets differ by a large `shift` (6,), else ()."""
+    """Return a note if contact is frequent and the `shift` (6,) of offsets is large, else ()."""
     force = float(np.linalg.norm(shift[:3]))
     if force <= found.force_threshold or found.touched.mean() < _MIN_CONTACT_SHARE_FOR_OFFSET_NOTE:
         return ()
@@ -246,7 +246,7 @@ def note_on_drift_or_much_contact(shift: Array, found: Detection) -> tuple[str, 
 
 
 def robust_offsets(residual: Array) -> tuple[Array, float]:
-    """Return offsets (6,) of a residual (N, 6), and the share of samples that agree, Eq. (T12)."""
+    """Return offsets (6,) of a residual (N, 6), and the share of samples near them, Eq. (T12)."""
     offsets = width_and_centre_of_narrowest_half(residual)[1]
     agrees: NDArray[np.bool_] = np.zeros(len(residual), bool)
     for _ in range(50):

@@ -51,7 +51,7 @@ _REMEDY_OF_CAUSE_WITHOUT_FIELD = {
 def add_corrected_fields(
     causes: Sequence[Finding], log: Log, *, by_pose: bool
 ) -> tuple[Finding, ...]:
-    """Return the causes with corrected description lines; `by_pose`: poses determine the motion."""
+    """Return causes with corrected YAML fields; `by_pose`: poses, not an IMU, give the motion."""
     fields, changed_names = _corrected_fields_and_changed_names(causes, log, by_pose)
     note, out = note_that_table_needs_description(log.source), []
     for cause, names in zip(causes, changed_names, strict=True):
@@ -65,7 +65,7 @@ def add_corrected_fields(
 
 
 def implausible_mass_message(mass: float, causes: Sequence[Finding], log: Log) -> str | None:
-    """Return a message on units for a mass of 1000 kg or more and a described wrench, else None."""
+    """Return a message on units for a described log and a mass of 1000 kg or more, else None."""
     if abs(mass) < MAX_PLAUSIBLE_MASS_KG or log.described is None or log.described.wrench is None:
         return None
     fields = _corrected_fields_and_changed_names(causes, log, by_pose=True)[0]
@@ -206,8 +206,7 @@ _MIN_STD_RATIO_TO_WIDEN = 1.5  # ratio of block to stated deviations that widens
 def explain_log(log: Log, delay_s: float, motion: PoseEstimate | None) -> MisfitExplanation | None:
     """Return causes why a rigid load does not explain the wrench of a log; None for a short log.
 
-    The motion, with its known delay `delay_s` [s] removed, is from the splines of `motion`, or from
-    the log if None.
+    The motion, without its delay `delay_s` [s], is from the splines of `motion`, else the log.
     """
 
     clock_rate: str | None = "clock rate of poses"
@@ -271,7 +270,7 @@ def _acceleration_noise_of_splines_m_s2(splines: PoseSplines) -> float:
 
 
 def apply_explanation_to_load(load: Identification, misfit: MisfitExplanation) -> Identification:
-    """Return the load fitted with the causes, else `load` with intervals widened by a misfit."""
+    """Return the load fitted with the causes, or `load`, with wider intervals for a misfit."""
     if misfit.causes or misfit.always_fitted or misfit.is_acceleration_missing:
         load = _replace_load_by_causes_fit(load, misfit)
     elif not misfit.explained and load.identifiable.any():
@@ -325,7 +324,7 @@ def _replace_load_by_causes_fit(load: Identification, misfit: MisfitExplanation)
 
 
 def use_pose_frame_finding(misfit: MisfitExplanation, finding: Finding) -> tuple[Finding, ...]:
-    """Return the causes; `finding` replaces frame and rotation if only these are extensions."""
+    """Return the causes; `finding` on the pose frame replaces them if no other term is fitted."""
     if misfit.fit.model.extensions and set(misfit.fit.model.extensions) <= {"frame", "rotation"}:
         kept = [x for x in misfit.causes if x.name not in ("pose frame", "sensor rotation")]
         return (finding, *kept)
@@ -343,7 +342,7 @@ def misfit_finding(misfit: MisfitExplanation, corrections: Sequence[Finding]) ->
 
 
 def check_request(correction: Finding) -> str:
-    """Return the request to check the likeliest correction of an unexplained record."""
+    """Return a text that requests a check of a correction that explains a part."""
     text = correction.message.partition("; set ")[0].partition("; correct ")[0]
     return f"no single correction explains the record; check whether {text}"
 

@@ -361,7 +361,7 @@ def _count_saturated_samples(x: Array, repeats: NDArray[np.bool_]) -> int:
 
 
 def _frozen_row_spans(values: Array, repeats: NDArray[np.bool_]) -> dict[int, tuple[int, int]]:
-    """Return first and last row of the longest wrongly constant part of each channel (N, k)."""
+    """Return first and last row of a wrongly constant part, by index of the channel (N, k)."""
     found = {}
     for i, x in enumerate(values.T):
         held = np.concatenate([[False], x[1:] == x[:-1]])

@@ -478,8 +478,8 @@ def eliminate_log(
         sigma: kept share of the load's wrench; with `gripper`, of the gripper's.
         sigma_object: kept share of the object's wrench, with `gripper` only; None: sigma.
         gamma: scale of the contact wrench.
-        eta: kept share of the object's wrench, Eq. (14), instead of the other scales; the gripper's
-            is removed.
+        eta: kept share of the object's wrench, Eq. (14), in place of the other scales; that of the
+            gripper is removed.
         sigma_weight, sigma_inertia: kept shares of weight and inertia, instead of sigma and
             sigma_object. They may differ if the log has an orientation.
         cutoff_hz: zero-phase low-pass on all outputs; None for no filter.

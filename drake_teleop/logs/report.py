@@ -67,7 +67,7 @@ def write_report(
     summary: Mapping[str, Any],
     object_load: Identification | None = None,
 ) -> None:
-    """Write the HTML report of an identification, including fit.png and knowledge.png beside it.
+    """Write the HTML report of an identification, with pictures fit.png and knowledge.png.
 
     `object_load` is the load of the object alone, if the gripper is known.
     """

@@ -162,7 +162,7 @@ def _motion_of_record(number: int) -> Callable[[Array], _Motion]:
 def _random_motion(
     random: np.random.Generator, scale: float, harmonics: int, period_s: float, rest_s: float
 ) -> Callable[[Array], _Motion]:
-    """Return a function of times [s]: `sensor_motion` of a random path between two rests."""
+    """Return the motion, as a function of times [s], of a random Fourier path between two rests."""
     sine, cosine = (
         random.normal(size=(2, 6, harmonics - 1)) * scale * _FOURIER_AMPLITUDES_RAD[:, np.newaxis]
     )

@@ -139,7 +139,7 @@ def summarize_detected_contact(found: EliminatedLog, causal_tare_s: float | None
 
 
 def shares_of_samples_above_force(eliminated: EliminatedLog, threshold: float) -> dict[str, Any]:
-    """Return shares of samples with |F| > `threshold` [N]: tared, without weight, without load."""
+    """Return shares of samples with |F| > `threshold` [N], for three stages of load removal."""
     wrenches = {
         "raw": eliminated.measured - eliminated.measured[0],
         "gravity_only": eliminated.gravity_only,

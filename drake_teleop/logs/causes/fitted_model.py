@@ -39,7 +39,6 @@ class UsedRows:
 
     @cached_property
     def rows_with_four_predecessors(self) -> NDArray[np.intp]:
-        """Indices of used rows whose four predecessors are used, too."""
         padded = np.pad(self.used, (instants.AR_ORDER, 0))
         return np.flatnonzero(sliding_window_view(padded, instants.AR_ORDER + 1).all(axis=1))
 

@@ -82,7 +82,6 @@ class BlockMeans:
 
     @cached_property
     def rows_per_search_block(self) -> int:
-        """Number of rows per block in the search for contacts and changes."""
         least = -(-len(self.t) // _MAX_BLOCKS)
         return max(least, _MIN_BLOCK_ROWS, round(_BLOCK_LENGTH_S / self.dt))
 

@@ -1,4 +1,4 @@
-"""Corrections of signs, axes, units and clocks in log descriptions so that a load fits, Eq. (5)."""
+"""Search for signs, axes, units and clocks of a log description with which a rigid load fits."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class LoadFitQuality:
         return self.mass > 0 and self.unexplained < limit
 
     def max_residual_share_including_noise(self, limit_without_noise: float) -> float:
-        """Return the limit of `unexplained`: `limit_without_noise` plus noise, at most 0.9."""
+        """Return the limit of the unexplained share: `limit_without_noise` + noise, at most 0.9."""
         return min(limit_without_noise + self.noise_share, MIN_RESIDUAL_SHARE_OF_UNKNOWN_LOAD)
 
 
@@ -159,7 +159,7 @@ _MAX_RESIDUAL_RATIO_AFTER_CORRECTION = 0.5
 def check_wrench_and_estimate_delay(
     description: Description, data: LogTables
 ) -> tuple[list[Finding], float | None]:
-    """Return findings on wrench, orientation, clocks; and delay of motion behind wrench [s]."""
+    """Return findings on wrench, orientation, clocks; delay of motion behind wrench [s] or None."""
     log = data.read_whole_log(description)
     delay = None if log.static else estimate_delay(log, 30.0)
     thin = data.read_thinned_log(description)
@@ -291,7 +291,7 @@ def _payload_or_lag_findings_and_delay(
 
 
 def undetermined_payload_finding(load: Identification, unexplained: float) -> Finding | None:
-    """Return a finding if the record does not determine the mass of the load, else None."""
+    """Return a finding if the mass of the load is undetermined; `unexplained` share of variance."""
     if load.verdicts[6] != "not" and unexplained < MIN_RESIDUAL_SHARE_OF_UNKNOWN_LOAD:
         return None
     deviation = float(load.standard_deviations[6])

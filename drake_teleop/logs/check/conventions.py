@@ -39,7 +39,7 @@ _MIN_WRENCH_RANGE_OVER_MAGNITUDE = 1e-6  # of a live wrench, over the largest re
 
 @dataclass(frozen=True)
 class ConventionCheckResult:
-    """Findings on a description, load fit, IMU mounting, delay of motion behind the wrench [s]."""
+    """Findings on a log description, with fit, IMU mounting, motion delay behind the wrench [s]."""
 
     findings: tuple[Finding, ...]
     fit: LoadFitQuality
@@ -63,7 +63,7 @@ def findings_if_load_is_suspicious(
 ) -> tuple[Finding, ...]:
     """Return findings, except "lag", if mass, fit, delay [s], gravity or a signal is implausible.
 
-    `predicted` (N, 6) is the wrench of offsets and load; `check` returns the findings. Raise
+    `predicted` (N, 6) is the wrench of offsets and load; `check` runs the checks. Raise
     DrakeTeleopError if the load is useless and a remedy is known.
     """
     if _is_wrench_constant(log):
@@ -101,7 +101,7 @@ def findings_if_load_is_suspicious(
 
 
 def motion_findings(check: Callable[[], ConventionCheckResult]) -> tuple[Finding, ...]:
-    """Return the findings of `check` that concern the described motion, not the wrench."""
+    """Run the checks and return the findings on the described motion, not on the wrench."""
     return tuple(x for x in _findings_except_lag(check) if x.name in edits.MOTION_FINDINGS)
 
 

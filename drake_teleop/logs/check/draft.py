@@ -94,7 +94,7 @@ _NO_TIME_NOTE = "No column of time was recognized; without one, set time: {rate:
 
 
 class Draft(NamedTuple):
-    """Draft of a log description: its streams as in YAML, comment lines, and findings."""
+    """Draft of a log description: streams as in YAML, comments and findings on these."""
 
     streams: dict[str, Any]
     comment_lines: list[str]

@@ -193,7 +193,6 @@ class LogTables:
         return read_described_log(description, self._source, tables=self.tables)
 
     def read_thinned_log(self, description: Description) -> Log:
-        """Return the thinned log (about 100 Hz), read as `description` defines it."""
         stamped = {}
         for name, stream in description.streams.items():
             if (time := getattr(stream, "time", None)) is not None:

@@ -24,8 +24,8 @@ def left_handed_pose_finding(
 ) -> Finding | None:
     """Return a finding if only a mirrored motion explains the wrench, else None.
 
-    A mirrored motion explains [P f; -P tau], where P is a signed permutation with determinant -1.
-    All axes and signs of force, torque and gravity are tried. `splines` are late by `delay_s` [s].
+    A mirrored motion explains [P f; -P tau] with a signed permutation P of determinant -1. All
+    axes and signs of force, torque and gravity are tried. `splines` lag the wrench by `delay_s`.
     """
     few = log.select_rows(slice(None, None, 1 + len(log) // _MAX_COMPARED_SAMPLES))
     wrench = (few.wrench - few.wrench.mean(axis=0)).reshape(-1, 2, 3)

@@ -294,7 +294,7 @@ _MAX_MASS_CENTRE_ERROR_OVER_DISTANCE = 0.03
 def position_unit_or_origin_findings(
     description: Description, data: LogTables, lag: float
 ) -> list[Finding]:
-    """Return a finding if positions have a wrong unit, or are not of the described point.
+    """Return a finding if positions have a wrong unit, or are of another point than described.
 
     The reference is the accelerometer, whose clock lags that of the pose by `lag` [s].
     """
@@ -376,7 +376,7 @@ def _centred_fit_and_deviations(
 
 
 def pose_unit_or_frame_finding(found: PoseEstimate, log: Log) -> Finding | None:
-    """Return a finding if positions have a wrong unit or the pose frame is not S, else None."""
+    """Return a finding if the estimated position unit is wrong or the pose frame is not S."""
     assert log.posed is not None
     pose = None if log.described is None else log.described.pose
     seen = found.units_and_axes
@@ -389,7 +389,7 @@ def pose_unit_or_frame_finding(found: PoseEstimate, log: Log) -> Finding | None:
 
 
 def pose_frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None:
-    """Return a finding if the pose frame is not S; None if another error is as likely."""
+    """Return a finding if the estimated pose frame is not S; None if other errors are as likely."""
     frame, seen, phi = found.frame, found.units_and_axes, found.free_frame_fit.parameters.theta[6:]
     if not (frame.is_shifted or frame.is_rotated) or phi[0] <= 0.0:
         return None

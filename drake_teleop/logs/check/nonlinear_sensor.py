@@ -25,7 +25,7 @@ _MESSAGE_OF_NONLINEARITY = {
 def error_of_load_by_nonlinear_sensor(
     log: Log, load: Identification
 ) -> tuple[Array, Finding | None]:
-    """Return likely errors (10,) of phi due to a nonlinear sensor, and a finding if they are large.
+    """Return errors (10,) of phi due to a nonlinear sensor, and a finding if they are large.
 
     The errors are 0 if no tested nonlinearity explains the residual. The log is without delay.
     """
@@ -80,7 +80,7 @@ def _fit_columns(wrench: Array, *columns: Array) -> tuple[Array, float]:
 
 
 def _backlash_error(x: Array) -> Array:
-    """Return the error (N, 6) of a reading of x (N, 6) with play, over half the play."""
+    """Return the error (N, 6) of a reading of x (N, 6) with backlash, in half backlash widths."""
     out, reading = np.zeros_like(x), x[0]
     for n in range(1, len(x)):
         reading = np.clip(reading, x[n] - _BACKLASH_OVER_RANGE, x[n] + _BACKLASH_OVER_RANGE)

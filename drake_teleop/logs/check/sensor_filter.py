@@ -16,7 +16,7 @@ _RATIOS_TO_BEST_CUTOFF = np.geomspace(0.84, 1.2, 9)
 
 
 def sensor_filter_finding(log: Log, delay_s: float) -> Finding | None:
-    """Return a finding if a high-pass or low-pass on the load's wrench explains the wrench."""
+    """Return a finding if the load's wrench, high- or low-passed, explains the reading."""
     from scipy.signal import butter, lfilter  # slow to import
 
     least, fitting = dict.fromkeys(("none", "high-pass", "low-pass"), np.inf), {"none": 1.0}

@@ -16,9 +16,9 @@ _MAX_COMPARED_SAMPLES, _MAX_MISFIT_RATIO, _MAX_UNEXPLAINED_SHARE = 1000, 0.1, 0.
 
 
 def wrench_channel_finding(log: Log, splines: PoseSplines | None, delay_s: float) -> Finding | None:
-    """Return a finding if a load explains the wrench after one correction only, else None.
+    """Return a finding if a load explains the wrench only after one tested correction, else None.
 
-    The log is without delay; `splines`, the source of its motion, are late by `delay_s` [s].
+    The delay of the log is removed; `splines` of its poses lag the wrench by `delay_s` [s].
     """
     few = log.select_rows(slice(None, None, 1 + len(log) // _MAX_COMPARED_SAMPLES))
     R_WS, names = few.R_WS, [*CHANNEL_NAMES]

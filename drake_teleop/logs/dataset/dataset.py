@@ -51,7 +51,7 @@ _CONTACT_MARGIN_FRAMES, _MIN_FREE_FRAMES_FOR_OFFSETS = 2, 20
 
 
 class DatasetAndLoad(NamedTuple):
-    """Dataset, its described streams and shared load."""
+    """Dataset with described streams and shared load."""
 
     dataset: Dataset
     streams: dict[str, Any]
@@ -75,7 +75,7 @@ def dataset_command(
     Args:
         load: identification.json of the load.
         identify: identify the load from the episodes instead.
-        description: log description whose `file` is omitted or one of the episodes.
+        description: log description; its `file` is replaced by each episode.
         jobs: number of parallel processes.
     """
     if (load is None) != identify:

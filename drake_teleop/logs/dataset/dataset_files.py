@@ -145,7 +145,7 @@ def _open_zarr(path: Path) -> Dataset:
 
 
 def write_dataset_copy(dataset: Dataset, out: Path, columns: Sequence[ContactColumns]) -> None:
-    """Write a copy of the dataset with the new columns of each episode to `out`."""
+    """Write a copy with new columns for each episode to `out`."""
     if dataset.kind == "hdf5":
         _write_hdf5_copy(dataset, out, columns)
         return

@@ -20,7 +20,7 @@ _MIN_WRENCH_ROTATION_DEG, _MIN_UNUSUAL_LAG_FRAMES, _MIN_SATURATED_FRAMES = 4.0, 
 
 
 class EpisodeFault(NamedTuple):
-    """Named fault with its description and figures."""
+    """Fault of an episode: name, text and value."""
 
     name: str
     message: str
@@ -30,7 +30,7 @@ class EpisodeFault(NamedTuple):
 def list_faults(
     hypothesis: WrenchHypothesis, usual_lag: float, usual_phi: Array, fps: float
 ) -> list[EpisodeFault]:
-    """Return the faults of an episode that the hypothesis x about its wrench implies.
+    """Return the faults of an episode that a hypothesis about its wrench implies.
 
     `usual_lag` [frames] is that of other episodes, `usual_phi` (10,) the usual load.
     """

@@ -46,14 +46,14 @@ class WrenchHypothesis:
     """Hypothetical relation of an episode's reading to the wrench of a load.
 
     Attributes:
-        kind: one of `TRIED_WRENCH_CONVENTIONS`.
+        kind: "sensor" (axes), "base" (axes) or "weight removed".
         lag: delay of the motion behind the wrench [frames].
-        axes: rotations or mirrorings (3, 3) of the load's force and torque.
+        axes: two rotations or mirrorings (3, 3), of the load's force and torque.
         gains: (2,) factors of force and torque.
         phi: (10,) of another load; None for the known one.
-        spread: (6,) logarithms of the half widths of the residual.
+        spread: (6,) logarithms of the residual's half widths.
         offsets: (6,) sensor offsets [N, N m].
-        cost: sum of `spread` and of the costs of all faults.
+        cost: sum of `spread`, plus a price for each fault.
     """
 
     kind: str
@@ -81,7 +81,7 @@ def fault_free_hypothesis(lag: float) -> WrenchHypothesis:
 
 
 def ln_half_width_and_centre(residual: Array, floor: Array) -> tuple[Array, Array]:
-    """Return log half widths (6,), at least log `floor`, and centres of a residual's calm half."""
+    """Return log half widths (6,), at least log `floor`, and centres of its calmer half."""
     widths, centres = width_and_centre_of_narrowest_half(residual)
     return np.log(np.maximum(0.5 * widths, floor)), centres
 
@@ -113,7 +113,7 @@ def find_simplest_hypothesis_and_residual(
 
 
 class HypothesisSearch:
-    """Search for the best hypothesis of an episode; half widths count as at least `floor` (6,)."""
+    """Search for the best hypothesis of an episode; half widths are at least `floor` (6,)."""
 
     def __init__(self, signals: EpisodeSignals, phi: Array, usual_lag: float, floor: Array) -> None:
         self.predict = lru_cache(maxsize=None)(partial(signals.measured_and_load_wrench, phi))
@@ -153,7 +153,7 @@ class HypothesisSearch:
                 yield self.refit_calm_rows(replace(start, axes=(M, M)), det=0.0, scale=True)
 
     def best_permutation(self, w: Array, p: Array, channels: slice) -> Array:
-        """Return the signed permutation M (3, 3) for which M p fits w best, in three channels."""
+        """Return the signed permutation M (3, 3) for which M p fits w best, in force or torque."""
         w, p, floor = w[:, channels], p[:, channels], self.floor[channels]
         pairs = w[:, :, None, None] - np.multiply.outer(p, [1.0, -1.0])[:, None]
         pairs = pairs.reshape(len(w), -1)
@@ -172,10 +172,9 @@ class HypothesisSearch:
         return min(map(fit, [at >= 0, *quarters]), key=lambda x: x.cost)
 
     def refit_calm_rows(self, x: WrenchHypothesis, *, det: float, scale: bool) -> WrenchHypothesis:
-        """Return x with rotation and factors fitted to the frames with the least residual.
+        """Return hypothesis x with axes and gains fitted to the frames with the least residual.
 
-        `det` is the determinant of the fitted rotation; 0 keeps that of x. `scale` fits the
-        factors.
+        `det` is the determinant of the fitted axes; 0 keeps those of x. `scale` fits the gains.
         """
         both = self.predict(x.kind, x.lag)
 
@@ -285,7 +284,7 @@ def _fault_weight_of_rotation(M: Array) -> float:
 def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array] | None:
     """Return the frame at which the offsets of a residual (N, 6) jump, and both offsets, or None.
 
-    Frames next to the jump already have constant offsets; contact begins gradually.
+    Unlike contact, a jump leaves constant offsets in all frames beside it.
     """
     n = len(residual)
     # Offsets that change in the middle enlarge the spread, but no differences of frames.

@@ -39,7 +39,7 @@ class SharedLoad:
         phi: (10,) load that is removed.
         lag_frames: usual delay of the motion behind the wrench [frames].
         usual_half_widths: (6,) usual half widths of the residual [N, N m].
-        noise_floor, threshold: noise floor and threshold of contact detection.
+        noise_floor, threshold: for contact detection.
     """
 
     identification: Identification
@@ -106,7 +106,7 @@ class _FittedEpisode(NamedTuple):
     own: WrenchHypothesis
 
     def fault_free_hypothesis_and_residual(self, phi: Array) -> tuple[WrenchHypothesis, Array]:
-        """Return the faultless hypothesis of load phi (10,) at the best lag, and its residual."""
+        """Return the best lag of load phi (10,) in S without faults, as hypothesis, and residual."""
         lag, count = self.own.lag, episode_verdict.NUM_LAGS_PER_FRAME
         search = episode_verdict.HypothesisSearch(self.signals, phi, lag, _MIN_HALF_WIDTHS_N_NM)
         lags = lag + np.arange(-count, count + 1) / count
@@ -118,7 +118,7 @@ class _FittedEpisode(NamedTuple):
         return best, search.reading_without_load(best)
 
     def spread_above_own_fit(self, phi: Array) -> float:
-        """Return how much load phi (10,) increases the log spread, compared with the own load."""
+        """Return the increase of the log spread by load phi (10,) instead of its own load."""
         usual = self.fault_free_hypothesis_and_residual(phi)[0]
         return float(usual.spread.sum() - self.own.spread.sum())
 

@@ -87,9 +87,9 @@ class PoseEstimate(PoseMotion):
     """Load, delay and pose frame from a wrench and poses.
 
     Attributes:
-        fit: fit with the given origin and axes of the pose frame, if given.
+        fit: fit with the origin and axes of the pose frame that are given.
         free_frame_fit: fit with an estimated pose frame, `frame`.
-        units_and_axes: unit of positions, axes and masses from the linear model's fit.
+        units_and_axes: position unit, axes and masses that a linear model implies.
         t, rejected: (M,) instants [s], and flags, True at disturbances.
         note: text if disturbances could not be rejected.
     """
@@ -104,7 +104,7 @@ class PoseEstimate(PoseMotion):
 
     @property
     def theta(self) -> Array:
-        """Estimate (16,) of [offsets; phi] [SI]."""
+        """Estimated [offsets; phi] (16,) [SI]."""
         return self.fit.parameters.theta
 
     @property
@@ -127,7 +127,7 @@ def estimate_from_poses(
 ) -> PoseEstimate:
     """Estimate load, sensor offsets, delay and pose frame P from a wrench and poses of P.
 
-    The wrench (N, 6) at even times `t` is [f; tau] on the load, in S about So [N, N m]. Each of
+    The wrench (N, 6) at equidistant `t` is [f; tau] on the load, in S about So [N, N m]. Each of
     `p_SoPo_S` [m], `R_SP` and the delay of the poses behind the wrench [s] is estimated if None,
     else kept. `gain_std` is the standard deviation of the sensor gains. Samples with `lost` True
     are excluded. IMU data of S are used if they fit the wrench better.

@@ -49,8 +49,8 @@ class LinearFit:
     """Fit of the wrench by free coefficients of 16 signals of the motion.
 
     Attributes:
-        coefficients: (6, 16); their product with the signals is the wrench; 0 for zero signals.
-        covariance: (6, 16, 16) of the rows of coefficients.
+        coefficients: (6, 16); their product with the signals is the wrench; 0 for absent signals.
+        covariance: (6, 16, 16) of each row of coefficients.
         noise_power: (bands, 6) mean noise power.
         channel_costs: (6,) negative log likelihood of each channel.
     """
@@ -67,9 +67,9 @@ class LinearFit:
 
 
 def fit_linear_model(Z: Array, levels: NoiseLevels, load: Array | None = None) -> LinearFit:
-    """Fit the wrench by 16 signals, from second moments Z (..., bands, n, n) of `Spectra`.
+    """Fit the wrench by 16 signals, from their second moments Z (..., bands, n, n).
 
-    With the coefficients `load` (6, 16) only the offsets are fitted.
+    If the coefficients `load` (6, 16) are given, only offsets are fitted.
     """
     zz, zf = (Z[..., :NUM_MOTION_SIGNALS, x] for x in (slice(NUM_MOTION_SIGNALS), WRENCH_COLUMNS))
     ff, floor = _wrench_channel_powers(Z), min_noise_power(Z, levels)
@@ -120,14 +120,14 @@ def _pseudo_inverses_of_grams(gram: Array) -> Array:
 
 
 def min_noise_power(Z: Array, levels: NoiseLevels) -> Array:
-    """Return a lower limit (..., 1, 6) of noise power, due to rounded numbers of the wrench."""
+    """Return a lower limit (..., 1, 6) of noise power, a small share of the wrench's power."""
     power = _wrench_channel_powers(Z).sum(axis=-2, keepdims=True) / levels.half_dof_of_bands.sum()
     both = power.reshape(*power.shape[:-1], 2, 3).sum(axis=-1).repeat(3, axis=-1)
     return np.maximum(MIN_NOISE_STD_OVER_WRENCH_RMS**2 * both, 1e-60)
 
 
 def fit_noise_levels(Z: Array, bands: FrequencyBands) -> NoiseLevels:
-    """Return noise levels; a channel's noise is white, plus a random walk if likelier (T74)."""
+    """Return noise levels from second moments Z: white, plus a random walk if likelier (T74)."""
     levels = NoiseLevels.white_noise_in_each_group(bands)
     least = fit_linear_model(Z, levels).channel_costs - _MIN_LOG_LIKELIHOOD_GAIN_BY_DRIFT
     shape = levels.relative_power.copy()
@@ -201,10 +201,10 @@ def guess_knot_spacing_and_delay(
 def choose_knot_spacing_and_delay(
     window: FitWindow, caches: Sequence[SplineCache], delay: float, *, fixed: bool
 ) -> tuple[SplineCache, float, float]:
-    """Return splines, knot spacing [s] and delay [s] of about the highest likelihood.
+    """Return splines, knot spacing [s] and delay [s] near the highest likelihood.
 
-    Knots are closer than at the highest likelihood: by 8 % with a known load, else by 16 %. The
-    delay is not changed if `fixed`.
+    Knots are closer by 8 % for a known load, else by 16 %, for a smaller bias. The delay is
+    kept if `fixed`.
     """
 
     def spectra_of(cache: SplineCache, knot_spacing_s: float) -> Spectra:
@@ -247,7 +247,7 @@ _MAX_DELAY_CHANGE_BY_CLOCK_DRIFT_S = 0.2
 def estimate_clock_rate_error(
     window: FitWindow, cache: SplineCache, delay: float, spacing: float
 ) -> float:
-    """Return the relative rate error of the poses' clock, such as 5e-5, or 0 if insignificant."""
+    """Return the relative rate error of the poses' clock, > 0 if fast; 0 if insignificant."""
     now, best = window.spectra_at_delay(cache.splines_with_spacing(spacing), delay), 0.0
     grid, least = window.grid, fit_coefficients(now).cost
     start = least

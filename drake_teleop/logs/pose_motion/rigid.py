@@ -46,9 +46,9 @@ class RigidFit:
 
     Attributes:
         parameters: estimated; `delay_s` is relative to the delay of the `Spectra`.
-        covariance: (23, 23) of [theta, tau, r, rotation about the axes of S]; inf on the diagonal
-            if undetermined, 0 if not free.
-        misfit: twice the log likelihood ratio to the linear model.
+        covariance: (23, 23) of [offsets, phi, delay, p_PoSo_P, rotation about the axes of S]; inf
+            on the diagonal if undetermined, 0 if not free.
+        misfit: twice the log likelihood ratio to the free linear model.
         degrees_of_freedom: those of the misfit.
         expected_misfit_by_gains: expected increase of the misfit by the stated gain errors.
     """
@@ -78,7 +78,7 @@ class RigidFit:
 
 
 def motion_transformation_matrix(R_PS: Array, p_PoSo_P: Array) -> Array:
-    """Return M (19, 22), (T79), from [16 signals of P; wrench] to [1; wrench; motion of S]."""
+    """Return M (19, 22), (T79): M [16 signals of P; wrench] = [1; wrench; 12 signals of S]."""
     M = np.zeros((19, NUM_MOTION_SIGNALS + 6))
     M[0, 0] = 1.0
     M[1:7, NUM_MOTION_SIGNALS:] = np.eye(6)
@@ -94,7 +94,7 @@ def motion_transformation_matrix(R_PS: Array, p_PoSo_P: Array) -> Array:
 def wrench_coefficients_of_load(phi: Array, removed_weight: Array | None = None) -> Array:
     """Return C (6, 16), Eq. (T73): C times the 16 motion signals is the wrench of load phi (10,).
 
-    It excludes the wrench of gravity on `removed_weight` [m, m c] (4,).
+    The robot has subtracted the `removed_weight` [m, m c] (4,).
     """
     M = motion_transformation_matrix(np.eye(3), np.zeros(3))[:, :NUM_MOTION_SIGNALS]
 
@@ -119,10 +119,10 @@ def fit_rigid(
     *,
     gain_std: float = 0.0,
 ) -> RigidFit:
-    """Fit a rigid load; all bands get one weight if no rigid load explains the wrench.
+    """Fit a rigid load; all bands have equal weights if no rigid load explains the wrench.
 
-    Z (bands, 38, 38) are `Spectra.second_moments_with_rates`, Q the part by noise of the poses.
-    Parameters with `free` (23,) True are estimated. The first weights are those of `linear`.
+    Z (bands, 38, 38) are the second moments of signals, wrench and signal rates; Q is their part
+    due to pose noise. Parameters with `free` (23,) True are estimated, from `start`.
     """
     record = _RigidFitData(Z, Q, levels, free, linear.noise_power)
     solution = _solve_rigid_fit(record, start)
@@ -231,7 +231,7 @@ def _residual_wrench_coefficients(params: RigidParameters) -> Array:
 
 
 def _residual_and_derivative(params: RigidParameters) -> tuple[Array, Array]:
-    """Return B = -de/dx (6, 23, 38), e (6, 38); e times 38 signals is the residual wrench."""
+    """Return -de/dx (6, 23, 38) by 23 parameters, e (6, 38): e times 38 signals is the residual."""
     L, M = _residual_wrench_coefficients(params), _delayed_motion_transformation(params)
     step = _ROTATION_DIFFERENCE_STEP_RAD
     B = np.zeros((6, NUM_RIGID_PARAMETERS, NUM_SPECTRAL_COLUMNS))
@@ -335,7 +335,7 @@ class UnitsAndAxes:
     Attributes:
         position_unit_ratio: unit error kappa of position; 1e-3 for mm described as m.
         position_unit_ratio_std: its standard deviation; inf if undetermined.
-        max_mass_std_kg: largest standard deviation in M_g (3, 3); the weight is M_g (-gravity).
+        max_mass_std_kg: largest standard deviation in M_g (3, 3), where force = M_g (-gravity).
         R_SP: (3, 3) polar factor of M_g; determinant -1 if mirrored.
         axis_masses_kg: (3,) singular values of M_g [kg].
     """

@@ -40,10 +40,9 @@ SIGNAL_RATE_SLICE = slice(NUM_MOTION_SIGNALS + 6, NUM_SPECTRAL_COLUMNS)
 
 @dataclass(frozen=True, eq=False)
 class WrenchGrid:
-    """Grid t (M,) of the motion signals [s] at a rate below 200 Hz, and samples of the wrench.
+    """Uniform times t (M,) of motion signals [s], below 200 Hz, and the wrench (M stride, 6).
 
-    `wrench` (N, 6) has `stride` samples for each instant. `known_load` (6, 16) are the
-    coefficients of a known load, Eq. (T73).
+    `known_load` (6, 16) are the coefficients of a known load, Eq. (T73).
     """
 
     t: Array
@@ -126,7 +125,7 @@ def exclude_from_taper(
 
 @dataclass(frozen=True, eq=False)
 class FitWindow:
-    """Data of a fit: weights `taper` (M,), gravity (3,) [m/s^2], highest frequency [Hz]."""
+    """Time window of a fit: weights `taper` (M,), gravity (3,) [m/s^2], highest frequency [Hz]."""
 
     grid: WrenchGrid
     taper: Array
@@ -156,7 +155,7 @@ class FitWindow:
 
     @cached_property
     def wrench_spectrum(self) -> ComplexArray:
-        """Spectrum (K, 6) of the tapered wrench, scaled as by `signal_spectrum`."""
+        """Spectrum (K, 6) of the tapered wrench at the grid rate."""
         stride, n = self.grid.stride, len(self.grid.wrench)
         fine = np.zeros(self.grid.transform_length * stride)
         full = np.interp(np.arange(n) / stride, np.arange(len(self.taper)), self.taper)
@@ -172,7 +171,7 @@ class FitWindow:
 
     @cached_property
     def is_taper_fixed(self) -> bool:
-        """Whether a delay shifts only the signals, not the taper: for gaps, or a known load."""
+        """Whether a delay shifts only the signals, not the taper: with gaps or a known load."""
         inside = np.flatnonzero(self.taper > 0.5)
         edged = len(inside) > 0 and len(inside) <= inside[-1] - inside[0]
         return bool(edged or self.grid.known_load is not None)
@@ -186,7 +185,7 @@ class FitWindow:
         return out
 
     def filtered_taper(self, response: NDArray[np.complexfloating]) -> Array:
-        """Return the zero-padded taper (M,), filtered by a `response` at each grid frequency."""
+        """Return the taper (M,), filtered by a frequency `response` on the grid."""
         n = self.grid.transform_length
         return np.asarray(np.fft.irfft(np.fft.rfft(self.taper, n) * response, n)[: len(self.taper)])
 
@@ -218,7 +217,7 @@ class Spectra:
     motion_signals: Array
 
     def with_delay(self, delay: float) -> Spectra:
-        """Return the spectra with `signals` at another delay [s]."""
+        """Return the spectra with motion signals at another delay [s]."""
         window, shift, signals = self.window, delay - self.delay, self.signals
         if window.is_taper_fixed:
             before = window.filtered_taper(np.exp(-2j * np.pi * window.grid.frequency * shift))
@@ -241,7 +240,7 @@ class Spectra:
         return second_moments(window.bands, self.signals, window.wrench_spectrum, rates)
 
     def second_moments_at_delays(self, delays: Array) -> Array:
-        """Return second moments (D, bands, 22, 22) at delays (D,) [s], valid in rows of signals."""
+        """Return second moments (D, bands, 22, 22) at delays (D,) [s], valid in signal rows."""
         bands, wrench = self.window.bands, self.window.wrench_spectrum
         if self.window.is_taper_fixed:
             return np.array([self.with_delay(delay).second_moments() for delay in delays])
@@ -261,13 +260,13 @@ class Spectra:
 
 
 def real_and_imaginary_rows(y: ComplexArray) -> Array:
-    """Return real rows (2 K, k): the real, then the imaginary part of each row of y (K, k)."""
+    """Return rows (2 K, k): real and imaginary part alternate for each row of y (K, k)."""
     parts = y.view(np.float64).reshape(*y.shape, 2)
     return parts.transpose(0, 2, 1).reshape(-1, y.shape[1])
 
 
 def second_moments(bands: FrequencyBands, *spectra: ComplexArray) -> Array:
-    """Return the sums of Re y* y^T (bands, n, n) in each band, for spectra y of n columns."""
+    """Return sums of Re conj(y) y^T (bands, n, n) in each band, for spectra y of n columns."""
     y = np.hstack(spectra) * np.sqrt(bands.frequency_weight)[:, None]
     # Real and imaginary parts as rows need only one real product per band.
     parts = (real_and_imaginary_rows(y[part]) for part in bands.slices)
@@ -295,7 +294,7 @@ class NoiseLevels:
     def noise_power(self, sums: Array, used: Array | None = None) -> Array:
         """Return the noise power (..., bands, 6) of residuals, from `sums` of squares in bands.
 
-        `used` (bands, 6) are the degrees of freedom of fitted parameters.
+        `used` (bands, 6) degrees of freedom are those of fitted parameters.
         """
         remaining = self.sums_over_groups(self.half_dof_of_bands)[:, None]
         if used is not None:
@@ -329,7 +328,7 @@ _ACCELERATION_COLUMNS, _GRAVITY_COLUMNS, _ALPHA_COLUMNS = slice(1, 4), slice(4, 
 
 
 def pose_noise_moments(splines: PoseSplines, spectra: Spectra, noise: tuple[float, float]) -> Array:
-    """Return the part (bands, 38, 38) of `Spectra.second_moments_with_rates` by noise of the poses.
+    """Return second moments (bands, 38, 38) of signals, wrench, signal rates due to pose noise.
 
     `noise`: standard deviations of position [m] and rotation [rad].
     """

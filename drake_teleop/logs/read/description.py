@@ -306,7 +306,6 @@ class Description(StrictModel):
 
     @property
     def streams(self) -> dict[str, Any]:
-        """Described streams by name: some of wrench, imu, pose and static."""
         names = ("wrench", "imu", "pose", "static")
         return {name: x for name in names if (x := getattr(self, name)) is not None}
 

@@ -24,7 +24,7 @@ SignalPairs = list[tuple[Array, Array]]
 
 
 def signal_pairs_of_pose_and_imu(t: Array, imu: Log, pose: Log, gyroscope: bool) -> SignalPairs:
-    """Return pairs of specific force (and omega if `gyroscope`): of pose at `t`, IMU at `imu.t`."""
+    """Return (pose signal at `t`, IMU signal) of specific force, and of omega if `gyroscope`."""
     signals = list(zip(pose.motion, imu.motion, strict=True))[: 1 + gyroscope]
     return [(resample(t, pose.t, x), y) for x, y in signals]
 
@@ -35,7 +35,7 @@ def lag_of_imu_clock(
     """Return the lag of the IMU's clock [s], within +-`max_lag_s`, with the best fit to the pose.
 
     The axes of the IMU may differ by any affine map. Components along `lever_effects` (N, k),
-    accelerations by a lever arm, are removed.
+    accelerations due to a lever arm, are removed.
     """
     U, singular, _ = np.linalg.svd(lever_effects - lever_effects.mean(axis=0), full_matrices=False)
     U = U[:, singular > 1e-3 * singular[0]]
@@ -153,7 +153,7 @@ _MIN_MOTION_OVER_NOISE_POWER = 20.0
 
 @dataclass(frozen=True)
 class LeverArm:
-    """Estimated position of the accelerometer.
+    """Estimated position of the accelerometer, as a correction.
 
     Attributes:
         p_SoIo_S: (3,) position minus `imu.position` of the log description, in S [m].
@@ -217,7 +217,7 @@ def lever_matrix(omega: Array, alpha: Array) -> Array:
 
 
 def are_lever_arm_axes_observable(K: Array, log: Log, cutoff: float) -> NDArray[np.bool_]:
-    """Return (3,) True for axes along which the motion K determines a lever arm."""
+    """Return (3,) True for axes along which accelerations K (N, 3, 3) determine a lever arm."""
     alpha = log.angular_acceleration
     wide, narrow = (alignment.low_pass(alpha, log.dt, x) for x in (2 * cutoff, cutoff))
     noise = (wide - narrow).var(axis=0) / 7

@@ -81,7 +81,7 @@ def rotate_world_to_S(R_WS: Array, vectors_W: Array) -> Array:
 
 
 def rotate_wrench_world_to_S(R_SW: Array, wrench_W: Array) -> Array:
-    """Rotate wrenches (N, 6) from the axes of W to those of S, about the same point."""
+    """Rotate wrenches (N, 6) from axes of W to S; the reference point is unchanged."""
     return np.einsum("nij,nkj->nki", R_SW, wrench_W.reshape(-1, 2, 3)).reshape(-1, 6)
 
 
@@ -98,9 +98,9 @@ class OrientationColumns:
             self._columns *= description.unit_in_si(described.unit)
 
     def allocate_quaternions(self, count: int) -> Array:
-        """Return an array (count, 4) for quaternions, possibly in the memory of the columns.
+        """Return an array (count, 4) for quaternions that may share memory with the columns.
 
-        Write row k only after the columns are read up to row k.
+        Write row k only after reading row k of the columns.
         """
         return self._columns[:count] if self._columns.shape[1] == 4 else np.empty((count, 4))
 

@@ -43,7 +43,7 @@ class Table:
     note: str = ""
 
     def line_in_file(self, row: int) -> int:
-        """Return the number in the file, for messages, of a row of this table."""
+        """Return the line number of a row in the file."""
         return self.first_row + int(row if self.kept_rows is None else self.kept_rows[row])
 
     def rows_with_any_number(self, names: Sequence[str | int]) -> Table:
