@@ -106,7 +106,7 @@ class _FittedEpisode(NamedTuple):
     own: WrenchHypothesis
 
     def fault_free_hypothesis_and_residual(self, phi: Array) -> tuple[WrenchHypothesis, Array]:
-        """Return the best lag of load phi (10,) in S without faults, as hypothesis, and residual."""
+        """Return the best lag of load phi (10,) without faults, as hypothesis, and residual."""
         lag, count = self.own.lag, episode_verdict.NUM_LAGS_PER_FRAME
         search = episode_verdict.HypothesisSearch(self.signals, phi, lag, _MIN_HALF_WIDTHS_N_NM)
         lags = lag + np.arange(-count, count + 1) / count

@@ -81,7 +81,7 @@ def _parse_gravity(value: Any) -> Any:
 def _parse_scale_factors(value: Any) -> Any:
     factors = value if isinstance(value, (list, tuple)) else [value]
     if any(_is_number(x) and abs(x) < _MIN_SCALE_FACTOR for x in factors):
-        raise ValueError(f"a scale factor is 0 (magnitude at least {_MIN_SCALE_FACTOR:g} required)")
+        raise ValueError(f"a scale factor is below {_MIN_SCALE_FACTOR:g} in magnitude")
     return [float(value)] * 3 if _is_number(value) else value
 
 
