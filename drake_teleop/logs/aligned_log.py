@@ -42,7 +42,7 @@ from drake_teleop.logs.read.reading import read_log
 from drake_teleop.logs.read.table_files import note_that_table_needs_description
 
 _MAX_KNOWN_DELAY_STD_S, _EDGE_MARGIN_OVER_KNOT_SPACING = 0.005, 2.0
-METHODS_WITH_SPLINES = ("robust", "consistent")
+SPLINE_METHOD_NAMES = ("robust", "consistent")
 """Methods that use splines; the others differentiate the motion and take it as exact."""
 _MIN_NOISE_STD_OVER_WRENCH_RMS = 1e-9
 MIN_SPLINE_RECORD_DURATION_S = 4.0  # shorter records have too few frequencies for splines
@@ -50,29 +50,29 @@ MIN_SPLINE_RECORD_DURATION_S = 4.0  # shorter records have too few frequencies f
 # and neighbours for smoothing.
 _MIN_SAMPLES_AT_REDUCED_RATE, _MAX_CUTOFF_OVER_REDUCED_RATE = 400_000, 0.25
 _CHUNK_SAMPLES, _FILTER_MARGIN_SAMPLES = 2**14, 2**8
-_PoseMotionT = TypeVar("_PoseMotionT", bound=PoseMotion)
+_PoseMotionType = TypeVar("_PoseMotionType", bound=PoseMotion)
 
 
 def _fit_with_fallback_delay(
     log: Log,
     delay: str | float,
-    fit: Callable[..., _PoseMotionT],
+    fit_at_delay: Callable[..., _PoseMotionType],
     fallback_delay_s: float,
     fallback_source: str,
-) -> tuple[_PoseMotionT, str]:
+) -> tuple[_PoseMotionType, str]:
     posed = log.posed
     assert posed is not None
     arrays = log.t, log.wrench, posed.poses, posed.gravity_W
-    fit = partial(fit, *arrays, lost=log.bridged, imu=posed.imu)
+    fit_at_delay = partial(fit_at_delay, *arrays, lost=log.bridged, imu=posed.imu)
     known, source = (None, "estimated") if delay == "auto" else choose_delay(log, None, delay)
-    found = fit(delay=known)
+    found = fit_at_delay(delay=known)
     if known is None and not found.delay_std_s < _MAX_KNOWN_DELAY_STD_S:
-        return fit(delay=fallback_delay_s), fallback_source
+        return fit_at_delay(delay=fallback_delay_s), fallback_source
     return found, source
 
 
 def use_spline_motion_and_flag_edges(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
-    """Return the log without delay, with spline motion; and flags (N,): True near ends and gaps."""
+    """Return the log without delay, with spline motion; and flags (N,): True near ends, gaps."""
     assert log.posed is not None
     moved, splines = alignment.remove_delay(log, found.delay_s), found.splines
     t, gravity_W = moved.t + found.delay_s, log.posed.gravity_W
@@ -87,14 +87,14 @@ def use_spline_motion_and_flag_edges(log: Log, found: PoseMotion) -> tuple[Log, 
     return moved, np.cumsum(change[:-1]) > 0.0
 
 
-def _pose_clock_rate_notes(found: PoseMotion) -> list[str]:
-    if not found.clock_rate_error:
+def _pose_clock_rate_notes(estimate: PoseMotion) -> list[str]:
+    if not estimate.clock_rate_error:
         return []
-    side = "faster" if found.clock_rate_error > 0.0 else "slower"
+    side = "faster" if estimate.clock_rate_error > 0.0 else "slower"
     return [
-        f"the clock of the pose runs {1e6 * abs(found.clock_rate_error):.0f} millionths {side} than"
-        " that of the wrench, which is corrected; to state it, multiply pose.time.scale (1 by"
-        f" default) by {1.0 / (1.0 + found.clock_rate_error):.6f}"
+        f"the clock of the pose runs {1e6 * abs(estimate.clock_rate_error):.0f} millionths {side}"
+        " than that of the wrench, which is corrected; to state it, multiply pose.time.scale (1 by"
+        f" default) by {1.0 / (1.0 + estimate.clock_rate_error):.6f}"
     ]
 
 
@@ -103,7 +103,7 @@ class AlignedLog:
     """Log with motion and wrench at the same instants.
 
     Attributes:
-        log: `specific_force` is the acceleration, `gravity` 0, if the robot removed the weight.
+        log: with gravity 0 and acceleration as specific force if the robot removed the weight.
         delay_s: removed delay of the motion behind the wrench [s].
         delay_source: "estimated", "given", "load" (identification file) or "static".
         log_with_differentiated_motion: log with numerically differentiated motion, if requested.
@@ -130,9 +130,9 @@ def read_aligned_log(
 ) -> AlignedLog:
     """Return the log in a file, without the delay between motion and wrench.
 
-    The motion is from splines of the poses, or from an IMU if the load phi (10,) then fits better.
-    The removed delay is `delay` [s], or its estimate for "auto", or `fallback_delay_s` if the
-    record does not determine it. `differentiate` adds numerically differentiated motion.
+    The motion is from pose splines, or from an IMU if the load phi (10,) then fits better. The
+    removed delay is `delay` [s], or its estimate for "auto", or `fallback_delay_s` if undetermined.
+    `differentiate` adds differentiated motion; `weight_removed`: the robot subtracted the weight.
     """
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=differentiate)
     weight_removed = weight_removed or "weight" in log.estimated
@@ -164,13 +164,13 @@ def read_aligned_log(
     edge = alignment.is_near_ends(log, log.one_sided_s, cutoff_hz)
     candidates.append(AlignedLog(log, delay_s, source, log, edge))
 
-    def sum_of_ln_robust_residual_widths(aligned: AlignedLog) -> float:
+    def ln_residual_width(aligned: AlignedLog) -> float:
         log = aligned.log
         residual = contact_wrench(log.wrench, np.zeros(6), *log.motion, phi)
         residual = low_pass(residual, log.dt, cutoff_hz)[~aligned.edge]
         return float(np.log(width_and_centre_of_narrowest_half(residual)[0] + 1e-12).sum())
 
-    return min(candidates, key=sum_of_ln_robust_residual_widths)
+    return min(candidates, key=ln_residual_width)
 
 
 def removed_weight_needs_orientation_error(where: str) -> DrakeTeleopError:
@@ -210,11 +210,11 @@ def fit_load_to_posed_log(
 ) -> tuple[LoadFitOfLog | None, tuple[Finding, ...]]:
     """Return the load identified from wrench and poses, and any finding on unit or frame of poses.
 
-    The load is None for a method without splines, a log at rest, a log without poses over 4 s, or
+    The load is None for a `method` without splines, a log at rest, poses over less than 4 s, or
     an IMU that contradicts the poses.
     """
     is_long = log.t[-1] - log.t[0] >= MIN_SPLINE_RECORD_DURATION_S
-    if log.posed is None or log.static or method not in METHODS_WITH_SPLINES or not is_long:
+    if log.posed is None or log.static or method not in SPLINE_METHOD_NAMES or not is_long:
         return None, ()
     estimate = partial(estimate_from_poses, gain_std=log.gain_std)
     is_delay_unknown = delay == "auto" and explain_lack_of_motion(log) is not None
@@ -261,18 +261,18 @@ def _reduce_sample_rate(log: Log, cutoff_hz: float | None) -> Log:
 
 
 def _batch_result_of_pose_estimate(
-    log: Log, found: PoseEstimate, rejected: NDArray[np.bool_], method: str, gain_std: float
+    log: Log, estimate: PoseEstimate, rejected: NDArray[np.bool_], method: str, gain_std: float
 ) -> BatchResult:
     kept = ~rejected
-    theta = _physically_consistent_theta(found) if method == "consistent" else found.theta
+    theta = _consistent_parameters(estimate) if method == "consistent" else estimate.theta
     residual = log.wrench - theta[:6] - non_contact_wrench(*log.motion, theta[6:])
     noise = np.sqrt(np.mean(residual[kept] ** 2, axis=0))
     size = np.sqrt(np.mean(log.wrench**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
     equations = SecondMoments(np.maximum(noise, _MIN_NOISE_STD_OVER_WRENCH_RMS * size + 1e-30))
     equations.add_samples(*(table[kept] for table in (log.wrench, *log.motion)))
-    plain = equations.solve(found.delay_s)
-    unknown = np.isinf(np.diag(plain.covariance)) | np.isinf(np.diag(found.covariance))
-    covariance = mark_undetermined(found.covariance, unknown)
+    plain = equations.solve(estimate.delay_s)
+    unknown = np.isinf(np.diag(plain.covariance)) | np.isinf(np.diag(estimate.covariance))
+    covariance = mark_undetermined(estimate.covariance, unknown)
     load: Identification = replace(
         plain,
         phi=theta[6:],
@@ -282,20 +282,20 @@ def _batch_result_of_pose_estimate(
         residual_rms=noise,
         method=METHODS[method].name,
     )
-    notes = [*([found.note] if found.note else []), *_pose_clock_rate_notes(found)]
-    if not found.fit.is_explained_by_gains:
+    notes = [*([estimate.note] if estimate.note else []), *_pose_clock_rate_notes(estimate)]
+    if not estimate.fit.is_explained_by_gains:
         verb, beyond = ("increase", " beyond the stated") if gain_std else ("state", "")
         notes.append(
             "the wrench is not that of a rigid load alone, which increases all standard deviations"
-            f" by a factor of {found.fit.std_inflation_by_misfit:.2g} (possible causes: gain"
+            f" by a factor of {estimate.fit.std_inflation_by_misfit:.2g} (possible causes: gain"
             f" errors{beyond}, bending, or a pose frame that is not S); {verb} wrench.gain_std, or"
             " correct the frame of the pose"
         )
     return BatchResult(load, noise, rejected, "; ".join(notes), equations)
 
 
-def _physically_consistent_theta(found: PoseEstimate) -> Array:
-    theta, covariance = found.theta, found.covariance
+def _consistent_parameters(estimate: PoseEstimate) -> Array:
+    theta, covariance = estimate.theta, estimate.covariance
     if theta[6] < 0.0 or np.isinf(np.diag(covariance)).any():
         return theta
     scale = 1.0 / np.sqrt(np.diag(covariance))

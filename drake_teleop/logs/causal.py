@@ -12,7 +12,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 
 _ROOT_OF_2, _FOURTH_ROOT_OF_3 = math.sqrt(2.0), 3.0**0.25
-CAUSAL_MODES = ("delayed", "predicted")
+CAUSAL_FILTER_MODES = ("delayed", "predicted")
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class CausalContactAndScaledWrench:
 def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float = 0.0) -> Array:
     """Filter samples x (N, ...) by a causal second-order Butterworth low-pass, Eq. (T11).
 
-    Extrapolate the output over `ahead_s` [s] by its slope. Return x without cut-off below Nyquist.
+    Extrapolate the output over `ahead_s` [s] by its slope. A cut-off above Nyquist has no effect.
     """
-    low_pass = low_pass_and_settled_state(dt, cutoff_hz, ahead_s)
+    low_pass = low_pass_coefficients(dt, cutoff_hz, ahead_s)
     if not len(low_pass):
         return x
     from scipy.signal import lfilter
@@ -48,8 +48,8 @@ def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float
     return lfilter(b, a, x, axis=0, zi=at_first)[0]
 
 
-def low_pass_and_settled_state(dt: float, cutoff_hz: float | None, ahead_s: float = 0.0) -> Array:
-    """Return the result (7,) of `design_low_pass`; (0,) without cut-off below half the rate."""
+def low_pass_coefficients(dt: float, cutoff_hz: float | None, ahead_s: float = 0.0) -> Array:
+    """Return filter coefficients and steady state (7,); (0,) if the filter has no effect."""
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         if ahead_s != 0.0:
             what = f"{cutoff_hz} is not below {0.5 / dt:g} Hz, half the rate, for a prediction"
@@ -65,7 +65,7 @@ def low_pass_and_settled_state(dt: float, cutoff_hz: float | None, ahead_s: floa
 def design_low_pass(dt, tangent, ahead_s, low_pass):
     """Write filter coefficients b (3), a (2) and settled state (2) to `low_pass` (7,), Eq. (T11).
 
-    `tangent` is tan(pi cutoff dt). The output is extrapolated by its slope over `ahead_s` [s].
+    `tangent` is tan(pi cutoff dt), `ahead_s` [s] the time over which the output is extrapolated.
     """
     k = 2.0 / dt
     w = k * tangent / _FOURTH_ROOT_OF_3
@@ -80,7 +80,7 @@ def design_low_pass(dt, tangent, ahead_s, low_pass):
     low_pass[5] = low_pass[6] + low_pass[1] - low_pass[3]
 
 
-def filter_lag(dt: float, cutoff_hz: float | None) -> float:
+def low_pass_delay_s(dt: float, cutoff_hz: float | None) -> float:
     """Return the delay [s] of `causal_low_pass` at low frequencies, without extrapolation."""
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         return 0.0
@@ -93,13 +93,13 @@ def compute_causal_wrench(
     """Return contact and scaled wrench (N, 6), low-passed as in a control loop.
 
     `delay_s`, the motion's delay behind the wrench, is rounded up to full samples. Mode "delayed"
-    keeps the lag; "predicted" extrapolates over it.
+    does not correct the lag; "predicted" extrapolates over it.
     """
-    if mode not in CAUSAL_MODES:
+    if mode not in CAUSAL_FILTER_MODES:
         what = f"{mode!r} is not a causal mode"
-        raise DrakeTeleopError(what, where="causal", remedy=f"give one of {CAUSAL_MODES}")
+        raise DrakeTeleopError(what, where="causal", remedy=f"give one of {CAUSAL_FILTER_MODES}")
     wait = max(0, math.ceil(delay_s / dt - 1e-6))
-    lag = wait * dt + filter_lag(dt, cutoff_hz)
+    lag = wait * dt + low_pass_delay_s(dt, cutoff_hz)
     ahead = lag if mode == "predicted" else 0.0
 
     def filter_and_delay(wrench: Array) -> Array:

@@ -22,7 +22,7 @@ from drake_teleop.load.contact.noise_floor import (
 from drake_teleop.logs.read.alignment import low_pass
 from drake_teleop.logs.read.canonical import Log
 
-_MAX_RATE_RATIO_TO_FREE_MOTION = 1.25  # of log and free motion, for statistics of several samples
+_MAX_SAMPLE_RATE_RATIO = 1.25  # of log and free motion, for statistics of several samples
 # Without orientation, gravity is the specific force below this frequency.
 _GRAVITY_LOW_PASS_CUTOFF_HZ = 0.5
 _MAX_QUIET_WRENCH_OVER_NOISE = 4.0
@@ -44,8 +44,8 @@ class Detection:
 
     Attributes:
         noise_floor: noise of the contact wrench in free motion.
-        statistic, threshold: name of the used statistic, and its threshold.
-        statistics: (N, 3) values of all statistics; 0 in samples that are not judged.
+        statistic, threshold: name of the used statistic, and its limit.
+        statistics: (N, 3) level, cusum, glr; 0 in samples near ends and edges.
         touched: (N,) True for contact, with hysteresis.
         free_duration_s: duration of the free motion that determined the noise floor [s].
         force_threshold: 1.25 times the largest |F_c| of the free motion [N].
@@ -62,7 +62,7 @@ class Detection:
 
     @property
     def is_above_threshold(self) -> NDArray[np.bool_]:
-        """Booleans (N,): True where the statistic reaches the threshold, without hysteresis."""
+        """Flags (N,): True where the statistic reaches the threshold, without hysteresis."""
         return self.statistics[:, statistic_index(self.statistic)] >= self.threshold
 
 
@@ -76,7 +76,7 @@ def samples_for_detector(log: Log, contact: Array, cutoff_hz: float | None) -> D
 
 
 def detect_contact(
-    rows: DetectorSamples,
+    samples: DetectorSamples,
     dt: float,
     cutoff_hz: float | None,
     covariance: Array,
@@ -86,15 +86,15 @@ def detect_contact(
     free: tuple[DetectorSamples, float] | None = None,
     statistic: str = "level",
 ) -> Detection | None:
-    """Find contact in a log; return None for fewer than 100 judged samples.
+    """Find contact in samples of a log; return None if too few are away from ends and edges.
 
     Samples with `edge` True, or within a period of the low-pass from the ends, are not judged.
     `covariance` (16, 16) is that of [offsets; phi], `residual_rms` (6,) that of the identification
     [N, N m]. `free` contains samples of another log in free motion, and their sample time [s].
     """
     period = 1.0 / (cutoff_hz or _ASSUMED_CUTOFF_WITHOUT_FILTER_HZ)
-    inner = _rows_far_from_ends_and_edges(rows, dt, period, edge)
-    judged = rows.select_rows(inner)
+    inner = _rows_far_from_ends_and_edges(samples, dt, period, edge)
+    judged = samples.select_rows(inner)
     if len(judged.contact) < MIN_NOISE_FLOOR_SAMPLES:
         return None
     hold, column = round(period / dt), statistic_index(statistic)
@@ -105,7 +105,7 @@ def detect_contact(
         )
     else:
         ratio = max(dt, free[1]) / min(dt, free[1])
-        if column > 0 and ratio > _MAX_RATE_RATIO_TO_FREE_MOTION:
+        if column > 0 and ratio > _MAX_SAMPLE_RATE_RATIO:
             what = f"{1.0 / free[1]:.4g} Hz is not the rate of the log, {1.0 / dt:.4g} Hz, as the"
             what += f" sums of statistic {statistic!r} require"
             remedy = "use statistic `level`, or free motion with the rate of the log"
@@ -117,10 +117,10 @@ def detect_contact(
         floor = detection.fit_noise_floor(*train, covariance, fade=math.exp(-free[1] / period))
         threshold = max(detection.NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES, floor.threshold(statistic))
         floor = replace(floor, fade=fade)
-    values, touched = np.zeros((len(rows.contact), 3)), np.zeros(len(rows.contact), bool)
+    values, touched = np.zeros((len(samples.contact), 3)), np.zeros(len(samples.contact), bool)
     detector = detection.ContactDetector(floor, threshold, statistic=statistic, hold=hold)
     values[inner] = detection.statistics_of_log(floor, *judged)
-    touched[inner] = _remove_hold_after_contact(detector.detect(*judged), hold)
+    touched[inner] = _remove_hold_time_after_contact(detector.detect(*judged), hold)
     if free is None:
         _remove_brief_weak_contacts(touched, values[:, column], threshold, hold)
     return Detection(
@@ -137,9 +137,9 @@ def detect_contact(
 
 
 def _rows_far_from_ends_and_edges(
-    rows: DetectorSamples, dt: float, period: float, edge: NDArray[np.bool_] | None = None
+    samples: DetectorSamples, dt: float, period: float, edge: NDArray[np.bool_] | None = None
 ) -> slice | NDArray[np.bool_]:
-    ends, judged = max(1, round(period / dt)), np.zeros(len(rows.contact), bool)
+    ends, judged = max(1, round(period / dt)), np.zeros(len(samples.contact), bool)
     judged[ends : len(judged) - ends] = True
     if edge is not None:
         judged &= ~edge
@@ -149,29 +149,29 @@ def _rows_far_from_ends_and_edges(
 
 
 def _fit_noise_floor_and_threshold(
-    rows: DetectorSamples, dt: float, hold: int, fade: float, covariance: Array, statistic: str
+    samples: DetectorSamples, dt: float, hold: int, fade: float, covariance: Array, statistic: str
 ) -> tuple[NoiseFloor, float, DetectorSamples]:
     from scipy.ndimage import maximum_filter1d
 
-    n = len(rows.contact)
+    n = len(samples.contact)
     block = max(hold, round(_MIN_FLOOR_BLOCK_DURATION_S / dt))
     selected = np.arange(n) // (10 * block) % math.ceil(n / _MAX_SAMPLES_FOR_NOISE_FLOOR) == 0
-    quiet = _find_quiet_samples(rows.contact, noise_floor(rows.contact))
+    quiet = _find_quiet_samples(samples.contact, noise_floor(samples.contact))
     if (quiet & selected).sum() < MIN_NOISE_FLOOR_SAMPLES:
         quiet = selected = np.ones(n, bool)
     block_of_row = np.minimum(np.arange(n) // block, n // block - 1)
     for _ in range(_QUIET_HALF_ITERATIONS if n >= _MIN_FLOOR_BLOCKS * block else 0):
         floor = detection.fit_noise_floor(
-            *rows.select_rows(quiet & selected), covariance, fade=fade
+            *samples.select_rows(quiet & selected), covariance, fade=fade
         )
-        level = detection.statistics_of_log(floor, *rows)[:, 0]
+        level = detection.statistics_of_log(floor, *samples)[:, 0]
         power = np.bincount(block_of_row, level**2) / np.bincount(block_of_row)
         half = (power <= np.median(power))[block_of_row]
         if (half & selected).sum() < MIN_NOISE_FLOOR_SAMPLES:
             break
         quiet = half
     for attempt in range(_NUM_CONTACT_REMOVAL_ROUNDS):
-        train = rows.select_rows(quiet & selected)
+        train = samples.select_rows(quiet & selected)
         floor = detection.fit_noise_floor(*train, covariance, fade=fade)
         values = detection.statistics_of_log(floor, *train)[:, statistic_index(statistic)]
         reached = _expected_maximum_in_free_motion(values, block, n)
@@ -180,12 +180,12 @@ def _fit_noise_floor_and_threshold(
         reached = max(_MIN_EXPECTED_MAX, reached)
         threshold = THRESHOLD_MARGIN * reached
         detector = detection.ContactDetector(floor, threshold, statistic=statistic, hold=hold)
-        without_contact = maximum_filter1d(detector.detect(*rows), 2 * block + 1) == 0
+        without_contact = maximum_filter1d(detector.detect(*samples), 2 * block + 1) == 0
         too_few = (selected & without_contact).sum() < MIN_NOISE_FLOOR_SAMPLES
         if too_few or attempt == _NUM_CONTACT_REMOVAL_ROUNDS - 1:
             break
         quiet = without_contact
-    return floor, _FINAL_THRESHOLD_OVER_EXPECTED_MAX * reached, rows.select_rows(quiet)
+    return floor, _FINAL_THRESHOLD_OVER_EXPECTED_MAX * reached, samples.select_rows(quiet)
 
 
 def _expected_maximum_in_free_motion(values: Array, block_size: int, num_samples: int) -> float:
@@ -199,7 +199,7 @@ def _expected_maximum_in_free_motion(values: Array, block_size: int, num_samples
     return math.exp(lower + scale * (rare - _GUMBEL_QUARTILE))
 
 
-def _remove_hold_after_contact(touched: NDArray[np.bool_], hold: int) -> NDArray[np.bool_]:
+def _remove_hold_time_after_contact(touched: NDArray[np.bool_], hold: int) -> NDArray[np.bool_]:
     for _, stop in find_runs_of_true(touched):
         if stop < len(touched):
             touched[stop - hold : stop] = False
@@ -234,7 +234,7 @@ def _notes_if_mostly_contact(
 
 
 def note_on_drift_or_much_contact(shift: Array, found: Detection) -> tuple[str, ...]:
-    """Return a note if contact is frequent and offsets differ by a large `shift` (6,), else ()."""
+    """Return a note if contact is frequent and the `shift` (6,) of offsets is large, else ()."""
     force = float(np.linalg.norm(shift[:3]))
     if force <= found.force_threshold or found.touched.mean() < _MIN_CONTACT_SHARE_FOR_OFFSET_NOTE:
         return ()
@@ -246,7 +246,7 @@ def note_on_drift_or_much_contact(shift: Array, found: Detection) -> tuple[str, 
 
 
 def robust_offsets(residual: Array) -> tuple[Array, float]:
-    """Return offsets (6,) of a residual (N, 6), and the share of samples that agree, Eq. (T12)."""
+    """Return offsets (6,) of a residual (N, 6), and the share of samples near them, Eq. (T12)."""
     offsets = width_and_centre_of_narrowest_half(residual)[1]
     agrees: NDArray[np.bool_] = np.zeros(len(residual), bool)
     for _ in range(50):

@@ -48,11 +48,11 @@ _REMEDY_OF_CAUSE_WITHOUT_FIELD = {
 }
 
 
-def add_description_lines(
+def add_corrected_fields(
     causes: Sequence[Finding], log: Log, *, by_pose: bool
 ) -> tuple[Finding, ...]:
-    """Return the causes with corrected description lines; `by_pose`: poses determine the motion."""
-    fields, changed_names = _corrected_fields_and_names_by_cause(causes, log, by_pose)
+    """Return causes with corrected YAML fields; `by_pose`: poses, not an IMU, give the motion."""
+    fields, changed_names = _corrected_fields_and_changed_names(causes, log, by_pose)
     note, out = note_that_table_needs_description(log.source), []
     for cause, names in zip(causes, changed_names, strict=True):
         lines = {name: _yaml_value(name, fields[name]) for name in names}
@@ -65,10 +65,10 @@ def add_description_lines(
 
 
 def implausible_mass_message(mass: float, causes: Sequence[Finding], log: Log) -> str | None:
-    """Return a message on units for a mass of 1000 kg or more and a described wrench, else None."""
+    """Return a message on units for a described log and a mass of 1000 kg or more, else None."""
     if abs(mass) < MAX_PLAUSIBLE_MASS_KG or log.described is None or log.described.wrench is None:
         return None
-    fields = _corrected_fields_and_names_by_cause(causes, log, by_pose=True)[0]
+    fields = _corrected_fields_and_changed_names(causes, log, by_pose=True)[0]
     force, torque = fields["wrench.force.scale"], fields["wrench.torque.scale"]
     likely = force * 10.0 ** -round(np.log10(abs(mass)))
     return (
@@ -81,7 +81,7 @@ def implausible_mass_message(mass: float, causes: Sequence[Finding], log: Log) -
     )
 
 
-def _corrected_fields_and_names_by_cause(
+def _corrected_fields_and_changed_names(
     causes: Sequence[Finding], log: Log, by_pose: bool
 ) -> tuple[DescriptionFields, list[list[str]]]:
     assert log.described is not None
@@ -200,23 +200,22 @@ def _correct_wrench_unit_or_torque_scale(fields: DescriptionFields, torque_facto
 _SPLINE_END_MARGIN_OVER_KNOT_SPACING = 2.0  # knots, at either end
 _MIN_BLOCK_MEANS_TO_EXPLAIN, _BLOCK_MEAN_BANDWIDTH_HZ = 50, 25.0
 _MAX_GYROSCOPE_GAIN_ERROR = 0.005
-_MIN_WIDENING_STD_RATIO = 1.5  # ratio of block to stated deviations that widens the intervals
+_MIN_STD_RATIO_TO_WIDEN = 1.5  # ratio of block to stated deviations that widens the intervals
 
 
-def explain_log(log: Log, delay_s: float, found: PoseEstimate | None) -> MisfitExplanation | None:
+def explain_log(log: Log, delay_s: float, motion: PoseEstimate | None) -> MisfitExplanation | None:
     """Return causes why a rigid load does not explain the wrench of a log; None for a short log.
 
-    The motion, with its known delay `delay_s` [s] removed, is from the splines of `found`, or from
-    the log if None.
+    The motion, without its delay `delay_s` [s], is from the splines of `motion`, else the log.
     """
 
     clock_rate: str | None = "clock rate of poses"
-    if log.has_calendar_time or (found and _does_gyroscope_agree_with_poses(log, found.splines)):
+    if log.has_calendar_time or (motion and _does_gyroscope_agree_with_poses(log, motion.splines)):
         clock_rate = None
 
     def means_at_additional_delay(more_s: float) -> BlockMeans:
-        if found is not None:
-            means = _block_means_of_splines(log, found, delay_s + more_s)
+        if motion is not None:
+            means = _block_means_of_splines(log, motion, delay_s + more_s)
             return replace(means, clock_rate=clock_rate)
         return block_means_of_log(remove_delay(log, delay_s + more_s))
 
@@ -224,16 +223,16 @@ def explain_log(log: Log, delay_s: float, found: PoseEstimate | None) -> MisfitE
     lengths = np.diff(find_runs_of_true(data.used)) - AR_ORDER  # rows with predecessors
     if lengths[lengths > 0].sum() < _MIN_BLOCK_MEANS_TO_EXPLAIN:
         return None
-    why = explain_misfit(data, means_at_additional_delay, log.estimated)
-    why = fit_with_missing_acceleration(why) if why.is_acceleration_missing else why
+    misfit = explain_misfit(data, means_at_additional_delay, log.estimated)
+    misfit = fit_with_missing_acceleration(misfit) if misfit.is_acceleration_missing else misfit
     if log.described is None:
-        return why
-    return replace(why, causes=add_description_lines(why.causes, log, by_pose=found is not None))
+        return misfit
+    return replace(misfit, causes=add_corrected_fields(misfit.causes, log, by_pose=bool(motion)))
 
 
-def _block_means_of_splines(log: Log, found: PoseEstimate, delay_s: float) -> BlockMeans:
+def _block_means_of_splines(log: Log, motion: PoseEstimate, delay_s: float) -> BlockMeans:
     assert log.posed is not None
-    splines, gravity = found.splines, log.posed.gravity_W
+    splines, gravity = motion.splines, log.posed.gravity_W
     middle = np.mean(log.posed.poses.position, axis=0)
 
     def motion_at(t: Array) -> tuple[Array, ...]:
@@ -270,21 +269,21 @@ def _acceleration_noise_of_splines_m_s2(splines: PoseSplines) -> float:
     return float(np.sqrt(np.trapezoid(density * share * (2.0 * np.pi * f) ** 4, f)))
 
 
-def apply_explanation_to_load(load: Identification, why: MisfitExplanation) -> Identification:
-    """Return the load fitted with the causes, else `load` with intervals widened by a misfit."""
-    if why.causes or why.always_fitted or why.is_acceleration_missing:
-        load = _replace_load_by_fit_of_causes(load, why)
-    elif not why.explained and load.identifiable.any():
+def apply_explanation_to_load(load: Identification, misfit: MisfitExplanation) -> Identification:
+    """Return the load fitted with the causes, or `load`, with wider intervals for a misfit."""
+    if misfit.causes or misfit.always_fitted or misfit.is_acceleration_missing:
+        load = _replace_load_by_causes_fit(load, misfit)
+    elif not misfit.explained and load.identifiable.any():
         stated = np.sqrt(np.diag(load.covariance))
-        ratio = np.maximum(1.0, why.misfit_deviations / np.maximum(stated, 1e-300))
+        ratio = np.maximum(1.0, misfit.misfit_deviations / np.maximum(stated, 1e-300))
         ratio = np.where(load.identifiable, ratio, 1.0)
-        if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) >= _MIN_WIDENING_STD_RATIO:
+        if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) >= _MIN_STD_RATIO_TO_WIDEN:
             factors = np.where(np.eye(16) > 0, ratio**2, np.outer(ratio, ratio))
             load = _replace_covariance_of_load(load, load.covariance * factors)
-    if why.state.data.gravity_W is not None:
+    if misfit.fit.means.gravity_W is not None:
         return load
-    extra = bias_of_load_by_alpha_noise(why.state)
-    share = why.state.data.alpha_noise_share
+    extra = bias_of_load_by_alpha_noise(misfit.fit)
+    share = misfit.fit.means.alpha_noise_share
     extra[10:] = np.hypot(extra[10:], share * np.abs(load.phi[[4, 7, 9]]).max())
     return _replace_covariance_of_load(load, load.covariance + np.diag(extra**2))
 
@@ -300,56 +299,56 @@ def _replace_covariance_of_load(load: Identification, covariance: Array) -> Iden
     return replace(load, covariance=covariance, identifiable=known)
 
 
-def _replace_load_by_fit_of_causes(load: Identification, why: MisfitExplanation) -> Identification:
-    identifiable = is_precise_enough(np.sqrt(np.diag(why.covariance)), why.theta[6:])
-    no_load = bool(why.causes) and why.causes[0].name == "no load"
-    if no_load or has_negative_mass(why.state):
+def _replace_load_by_causes_fit(load: Identification, misfit: MisfitExplanation) -> Identification:
+    identifiable = is_precise_enough(np.sqrt(np.diag(misfit.covariance)), misfit.theta[6:])
+    no_load = bool(misfit.causes) and misfit.causes[0].name == "no load"
+    if no_load or has_negative_mass(misfit.fit):
         identifiable = np.repeat([True, False], [6, 10])
-    if why.needs_full_gain_matrix:
+    if misfit.needs_crosstalk_calibration:
         identifiable = np.zeros(16, bool)
     return replace(
         load,
-        phi=why.theta[6:],
-        offsets=why.theta[:6],
-        covariance=why.covariance,
+        phi=misfit.theta[6:],
+        offsets=misfit.theta[:6],
+        covariance=misfit.covariance,
         identifiable=identifiable,
-        residual_rms=why.state.rows.residual_rms(why.state.residual),
-        weight_removed=any(cause.name == "weight removed" for cause in why.causes)
-        or "weight" in why.always_fitted,
+        residual_rms=misfit.fit.rows.residual_rms(misfit.fit.residual),
+        weight_removed=any(cause.name == "weight removed" for cause in misfit.causes)
+        or "weight" in misfit.always_fitted,
         prior_dominated=np.zeros(16, bool),
         degrees_of_freedom=np.full(16, np.inf),
         method="least squares without acceleration"
-        if why.is_acceleration_missing
+        if misfit.is_acceleration_missing
         else "generalised least squares with named causes",
     )
 
 
-def replace_frame_causes(why: MisfitExplanation, finding: Finding) -> tuple[Finding, ...]:
-    """Return the causes; `finding` replaces frame and rotation if only these are extensions."""
-    if why.state.model.extensions and set(why.state.model.extensions) <= {"frame", "rotation"}:
-        kept = [x for x in why.causes if x.name not in ("pose frame", "sensor rotation")]
+def use_pose_frame_finding(misfit: MisfitExplanation, finding: Finding) -> tuple[Finding, ...]:
+    """Return the causes; `finding` on the pose frame replaces them if no other term is fitted."""
+    if misfit.fit.model.extensions and set(misfit.fit.model.extensions) <= {"frame", "rotation"}:
+        kept = [x for x in misfit.causes if x.name not in ("pose frame", "sensor rotation")]
         return (finding, *kept)
-    return why.causes
+    return misfit.causes
 
 
-def misfit_finding(why: MisfitExplanation, corrections: Sequence[Finding]) -> Finding:
+def misfit_finding(misfit: MisfitExplanation, corrections: Sequence[Finding]) -> Finding:
     """Return the finding of a misfit that none of the fitted `corrections` explains."""
-    ratio = why.state.residual_ratio
+    ratio = misfit.fit.residual_ratio
     text = f"the residual is up to {ratio:.0f} times the sensor's noise"
     remedy = "record without contact, with the same load throughout and with loose cables"
     if corrections:
-        return Finding("misfit", f"{text}, and {correction_question(corrections[0])}; or {remedy}")
+        return Finding("misfit", f"{text}, and {check_request(corrections[0])}; or {remedy}")
     return Finding("misfit", f"{text}, and no known cause explains it; {remedy}")
 
 
-def correction_question(correction: Finding) -> str:
-    """Return the request to check the likeliest correction of an unexplained record."""
+def check_request(correction: Finding) -> str:
+    """Return a text that requests a check of a correction that explains a part."""
     text = correction.message.partition("; set ")[0].partition("; correct ")[0]
     return f"no single correction explains the record; check whether {text}"
 
 
-def missing_acceleration_finding(why: MisfitExplanation) -> Finding:
-    ratio = why.state.residual_ratio
+def missing_acceleration_finding(misfit: MisfitExplanation) -> Finding:
+    ratio = misfit.fit.residual_ratio
     text = (
         f"the residual is up to {ratio:.0f} times the sensor's noise, and without accelerometer or"
         " position the acceleration of S may cause it: the delay, the unit of the torque and the"
@@ -358,10 +357,10 @@ def missing_acceleration_finding(why: MisfitExplanation) -> Finding:
     return Finding("acceleration", f"{text}; add the position to pose, or an accelerometer")
 
 
-def removed_weight_note(why: MisfitExplanation) -> str:
-    if "weight" not in why.always_fitted:
+def removed_weight_note(misfit: MisfitExplanation) -> str:
+    if "weight" not in misfit.always_fitted:
         return ""
-    (mass, *moment), covariance = why.state.parameters_of_extension("weight")
+    (mass, *moment), covariance = misfit.fit.parameters_of_extension("weight")
     deviation = float(np.sqrt(covariance[0, 0]))
     com = ", ".join(f"{1e3 * x / mass:.3g}" for x in moment) if mass else "0, 0, 0"
     return (

@@ -17,7 +17,7 @@ from drake_teleop.common.numeric import Array, find_runs_of_true, white_noise_de
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check.conventions import check_conventions
 from drake_teleop.logs.check.draft import Draft, draft_description, join_drafts
-from drake_teleop.logs.explained_log import correction_question
+from drake_teleop.logs.explained_log import check_request
 from drake_teleop.logs.processing import check_log
 from drake_teleop.logs.read import clocks
 from drake_teleop.logs.read.bags import draft_of_bag, is_bag, list_topics, read_bag_topic_or_table
@@ -146,13 +146,13 @@ def _correct_and_write_draft(draft: Draft, path: Path, summary: dict[str, Any]) 
     write_text(path, _append_checksum(text))
 
 
-def _names_of_fields_to_fill_in(fields: dict[str, Any], outer: str = "") -> list[str]:
+def _names_of_fields_to_fill_in(fields: dict[str, Any], prefix: str = "") -> list[str]:
     out = []
     for name, value in fields.items():
         if isinstance(value, dict):
-            out += _names_of_fields_to_fill_in(value, f"{outer}{name}.")
+            out += _names_of_fields_to_fill_in(value, f"{prefix}{name}.")
         elif value == "FILL IN" or (isinstance(value, list) and "FILL IN" in value):
-            out.append(f"{outer}{name}")
+            out.append(f"{prefix}{name}")
     return out
 
 
@@ -170,7 +170,7 @@ def _correct_draft_by_data(draft: Draft, path: Path, summary: dict[str, Any]) ->
         write_text(path, _append_checksum(corrected.text()))
     if first is not None and any(finding.name == "misfit" for finding in found):
         write_text(path, _append_checksum(draft.text()))
-        question = {"name": "misfit", "message": correction_question(first)}
+        question = {"name": "misfit", "message": check_request(first)}
         others = [x for x in given["findings"] if x["message"] != first.message]
         summary |= given | {"findings": [*others, question]}
 
@@ -233,7 +233,7 @@ def _inspect_stream_and_list_bad_rows(
         findings += more
         if len(usable) != len(good):
             what = f"has {len(good)} rows, but {len(usable)} times"
-            remedy = "name columns of the same length"
+            remedy = "use columns of the same length"
             raise DrakeTeleopError(what, where=f"{source}:{name}", remedy=remedy)
     figures["nan_rows"], figures["nan_longest"] = int((~good).sum()), _max_run_length(~good)
     if not good.all():
@@ -314,9 +314,9 @@ def _inspect_clock_and_flag_usable_rows(
     forward = steps[steps > 0]
     if not len(forward):
         what = "the time stamps never increase"
-        raise DrakeTeleopError(what, where=at, remedy="name another column, or time.rate")
+        raise DrakeTeleopError(what, where=at, remedy="set time.column or time.rate")
     median = float(np.median(forward))
-    back, inner = (steps <= 0).sum(), clocks.zero_steps_between_episodes(steps, median, episodes)
+    back, inner = (steps <= 0).sum(), clocks.set_episode_steps_to_zero(steps, median, episodes)
     gaps = int((inner > clocks.min_gap_length_s(median, BANDWIDTH_FOR_GAP_LENGTH_HZ)).sum())
     longest = float(inner.max())
     rate = len(t) / len(np.unique(t)) / median  # of rows, which may share time stamps
@@ -361,7 +361,7 @@ def _count_saturated_samples(x: Array, repeats: NDArray[np.bool_]) -> int:
 
 
 def _frozen_row_spans(values: Array, repeats: NDArray[np.bool_]) -> dict[int, tuple[int, int]]:
-    """Return first and last row of the longest wrongly constant part of each channel (N, k)."""
+    """Return first and last row of a wrongly constant part, by index of the channel (N, k)."""
     found = {}
     for i, x in enumerate(values.T):
         held = np.concatenate([[False], x[1:] == x[:-1]])

@@ -67,7 +67,7 @@ def draw_fit(found: IdentifiedLog) -> Figure:
 
 
 def draw_spectrum_and_intervals(found: IdentifiedLog) -> Figure:
-    """Draw the spectrum of the residual, and intervals and verdicts of the parameters."""
+    """Draw the residual's spectrum, and intervals and identifiability of parameters."""
     with plot_style():
         figure: Any = Picture(figsize=(10, 7.4))
         log, result = found.log, found.identification
@@ -129,7 +129,7 @@ def _draw_parameter_intervals(figure: Any, result: Identification) -> None:
     for row, (value, colour) in enumerate(zip(theta, colours, strict=True)):
         marker = "o" if abs(value) < limit else ">" if value > 0 else "<"
         left.plot(np.clip(value, -0.97 * limit, 0.97 * limit), row, marker, color=colour, ms=4.5)
-    left.set(xlim=(-limit, limit), title="95 % intervals, relative to a typical value")
+    left.set(xlim=(-limit, limit), title="95 % intervals / typical parameter value")
     left.axvline(0, color=GREY, linewidth=0.8)
     floor = 1e-5
     widths = np.clip(np.where(np.isfinite(deviations), deviations, 10.0), floor, 10.0)
@@ -139,7 +139,7 @@ def _draw_parameter_intervals(figure: Any, result: Identification) -> None:
     for share, words in ((0.05, "5 %"), (0.5, "50 %")):
         right.axvline(share, color=BLACK, linewidth=0.8, linestyle="--")
         right.text(share, -0.9, words, fontsize=8, ha="center", va="bottom")
-    right.set_title("Standard deviation relative to a typical value", pad=16)
+    right.set_title("Standard deviation / typical parameter value", pad=16)
     handles = [
         Patch(color=VERDICT_COLOURS[verdict], label=TEXT_OF_VERDICT[verdict])
         for verdict in VERDICT_NAMES
@@ -149,9 +149,9 @@ def _draw_parameter_intervals(figure: Any, result: Identification) -> None:
 
 
 def draw_elimination(found: EliminatedLog) -> Figure:
-    """Draw force magnitude and the six channels of each wrench; shade contacts."""
+    """Draw |F| and channels of measured, contact and scaled wrench; shade contacts."""
     curves = [("measured, offsets removed", found.measured, _MEASURED_CURVE_COLOUR)]
-    curves += _curves_without_static_weight(found)
+    curves += _curve_without_static_weight(found)
     if found.causal is not None:
         curves.append((f"contact, causal ({found.causal.mode})", found.causal.contact, PURPLE))
     curves.append(("contact wrench", found.contact, BLUE))
@@ -177,7 +177,7 @@ def draw_elimination(found: EliminatedLog) -> Figure:
     return figure
 
 
-def _curves_without_static_weight(found: EliminatedLog) -> _Curves:
+def _curve_without_static_weight(found: EliminatedLog) -> _Curves:
     weightless = found.gravity_only
     return [] if weightless is None else [("static weight removed", weightless, ORANGE)]
 
@@ -193,7 +193,7 @@ def draw_detection(found: DetectedLog) -> Any:
         raw = eliminated.measured - eliminated.measured[0]
         for name, wrench, colour in (
             ("measured, tared at the start", raw, _MEASURED_CURVE_COLOUR),
-            *_curves_without_static_weight(eliminated),
+            *_curve_without_static_weight(eliminated),
             ("contact", eliminated.contact, BLUE),
         ):
             top.plot(t, np.linalg.norm(wrench[inner, :3], axis=1), color=colour, label=name)
@@ -205,7 +205,7 @@ def draw_detection(found: DetectedLog) -> Any:
         below.axhline(found.threshold, color=BLACK, linewidth=0.8, linestyle="--")
         below.set(xlabel="time [s]", ylabel=f"{found.statistic} [standard deviations]")
         share = 100 * found.is_above_threshold.mean()
-        below.set_title(f"above the threshold {share:.2g} % of the time")
+        below.set_title(f"statistic above its threshold {share:.2g} % of the time")
         for axis in (top, below):
             shade_contact(axis, t, found.touched[inner])
         figure.legend(loc="outside lower center", ncols=3)

@@ -1,4 +1,4 @@
-"""Identification of the load, and its removal, for log files (long: three commands)."""
+"""Identification of the load, and its removal, for log files (long: code of three commands)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs import aligned_log, explained_log
 from drake_teleop.logs import contact as contacts
-from drake_teleop.logs.aligned_log import METHODS_WITH_SPLINES, LoadFitOfLog, read_aligned_log
+from drake_teleop.logs.aligned_log import SPLINE_METHOD_NAMES, LoadFitOfLog, read_aligned_log
 from drake_teleop.logs.causal import CausalContactAndScaledWrench, compute_causal_wrench
 from drake_teleop.logs.causes.cause import (
     CAUSES_DETERMINED_AT_REST,
@@ -40,7 +40,7 @@ from drake_teleop.logs.causes.cause import (
 )
 from drake_teleop.logs.causes.explain import MisfitExplanation
 from drake_teleop.logs.check import against_load, conventions, edits
-from drake_teleop.logs.check.against_load import MAX_GOOD_UNEXPLAINED, lag_findings
+from drake_teleop.logs.check.against_load import MAX_GOOD_RESIDUAL_SHARE, lag_findings
 from drake_teleop.logs.check.conventions import ConventionCheckResult, check_conventions_of_file
 from drake_teleop.logs.check.handedness import left_handed_pose_finding
 from drake_teleop.logs.check.motion_size import MORE_MOTION_REMEDY, explain_lack_of_motion
@@ -230,7 +230,7 @@ def identify_log(
 def _read_and_fit_load(
     path: str | Path, method: str, cutoff_hz: float | None, delay: str | float
 ) -> tuple[Log, LoadFitOfLog, tuple[Finding, ...]]:
-    log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in METHODS_WITH_SPLINES)
+    log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in SPLINE_METHOD_NAMES)
     fitted, frame_findings = aligned_log.fit_load_to_posed_log(log, method, cutoff_hz, delay)
     if fitted is None and log.posed is not None and log.posed.imu is None:  # too short for splines
         log = read_log(path, bandwidth_hz=cutoff_hz)
@@ -242,7 +242,7 @@ def _left_handed_pose_finding(log: Log, fitted: LoadFitOfLog) -> Finding | None:
         return None
     load, shown = fitted.fit.identification, fitted.log
     residual = contact_wrench(shown.wrench, load.offsets, *shown.motion, load.phi)
-    if against_load.unexplained_share(shown.wrench, residual) < MAX_GOOD_UNEXPLAINED:
+    if against_load.unexplained_share(shown.wrench, residual) < MAX_GOOD_RESIDUAL_SHARE:
         return None
     splines = None if fitted.motion is None else fitted.motion.splines
     return left_handed_pose_finding(shown, splines, fitted.delay_s)
@@ -251,7 +251,7 @@ def _left_handed_pose_finding(log: Log, fitted: LoadFitOfLog) -> Finding | None:
 def _explain_residual(
     log: Log, fitted: LoadFitOfLog, frame_findings: tuple[Finding, ...]
 ) -> tuple[MisfitExplanation | None, str | None]:
-    """Return causes of the residual, or a text if the motion is too small to separate them.
+    """Return causes of the residual, or the reason why the motion is too small to separate them.
 
     Gain errors within `log.gain_std` are no causes.
     """
@@ -352,10 +352,10 @@ def _apply_explanation(
 ) -> tuple[Identification, tuple[Finding, ...], str]:
     causes = misfit.causes
     if frame_findings:
-        causes = explained_log.replace_frame_causes(misfit, frame_findings[0])
+        causes = explained_log.use_pose_frame_finding(misfit, frame_findings[0])
     if raw.estimated:
         note = explained_log.removed_weight_note(misfit)
-    elif causes and not misfit.needs_full_gain_matrix:
+    elif causes and not misfit.needs_crosstalk_calibration:
         note = ""
     return explained_log.apply_explanation_to_load(load, misfit), causes, note
 
@@ -366,7 +366,7 @@ def _unexplained_misfit(
     corrections: list[Finding],
     unexplained: float,
 ) -> MisfitExplanation | None:
-    """Return `misfit` if causes, noise, vibrations or unknown accelerations do not explain it."""
+    """Return `misfit`, or None if causes, noise or a missing acceleration explain it."""
     if misfit is None or not misfit.is_misfit or misfit.is_acceleration_missing:
         return None
     useless = not misfit.causes and unexplained > 0.5
@@ -412,7 +412,7 @@ def _is_misfit_explainable(log: Log, has_splines: bool) -> bool:
 
 
 def check_log(path: Path, checks: ConventionCheckResult | None = None) -> ConventionCheckResult:
-    """Return the checks of a log and its description, with causes that identification finds."""
+    """Identify the load and return `checks` of the log (computed if None), with found causes."""
     checks = check_conventions_of_file(path) if checks is None else checks
     try:
         identified = identify_log(path, checks=checks)
@@ -478,8 +478,8 @@ def eliminate_log(
         sigma: kept share of the load's wrench; with `gripper`, of the gripper's.
         sigma_object: kept share of the object's wrench, with `gripper` only; None: sigma.
         gamma: scale of the contact wrench.
-        eta: kept share of the object's wrench, Eq. (14), instead of the other scales; the gripper's
-            is removed.
+        eta: kept share of the object's wrench, Eq. (14), in place of the other scales; that of the
+            gripper is removed.
         sigma_weight, sigma_inertia: kept shares of weight and inertia, instead of sigma and
             sigma_object. They may differ if the log has an orientation.
         cutoff_hz: zero-phase low-pass on all outputs; None for no filter.
@@ -517,10 +517,10 @@ def eliminate_log(
     if untouched_s is not None and not tare:
         what = "a contact-free span cannot be combined with --offsets load (tare=False)"
         raise DrakeTeleopError(what, where="untouched", remedy="remove one of the two")
-    found = _read_and_eliminate_log(path, *common, untouched_s, causal, causal_tare_s)
+    found = _read_log_and_remove_load(path, *common, untouched_s, causal, causal_tare_s)
     reference = None
     if free is not None:
-        free_log = _read_and_eliminate_log(free, *common)
+        free_log = _read_log_and_remove_load(free, *common)
         _reject_static_log(free_log)
         _reject_static_log(found)
         free_samples = contacts.samples_for_detector(free_log.log, free_log.contact, cutoff_hz)
@@ -549,7 +549,7 @@ def _reject_static_log(found: EliminatedLog) -> None:
         )
 
 
-def _read_and_eliminate_log(
+def _read_log_and_remove_load(
     path: str | Path,
     identification: Identification,
     phi_gripper: Array,
@@ -600,10 +600,10 @@ def _read_and_eliminate_log(
     sigmas = {name: scales[name] for name in scales if name not in ("gamma", "gravity")}
     weights, inertias = compensation.weight_scales_and_inertia_scales(**sigmas)
     if weights != inertias and removed:
-        raise weight_scale_without_effect_error(log.source)
+        raise useless_weight_scale_error(log.source)
     if weights != inertias and log.gravity is None:
         where = f"{log.source}: gravity in the sensor frame"
-        raise compensation.unknown_gravity_error(where, "add an orientation, or use sigma alone")
+        raise compensation.unknown_gravity_error(where, "add an orientation, or omit sigma_weight")
     if log.gravity is not None:
         rest = np.zeros_like(log.gravity)
         weightless = contact_wrench(log.wrench, np.zeros(6), -log.gravity, rest, rest, phi)
@@ -705,9 +705,9 @@ def _check_log_if_contact_is_large(
     return tuple(x for x in check_log(path).findings if x.name not in ignored)
 
 
-def weight_scale_without_effect_error(where: str) -> DrakeTeleopError:
+def useless_weight_scale_error(where: str) -> DrakeTeleopError:
     what = "the robot has removed the weight, so that sigma_weight has no effect"
-    return DrakeTeleopError(what, where=where, remedy="use sigma alone, which scales the inertia")
+    return DrakeTeleopError(what, where=where, remedy="omit sigma_weight; sigma scales the inertia")
 
 
 def _resolve_force_scales(
@@ -716,7 +716,7 @@ def _resolve_force_scales(
     for name, value in given_scales.items():
         if value is not None and not 0.0 <= to_float(name, value) <= _MAX_TELEOP_FORCE_SCALE:
             what = f"{value:g} is outside 0 to {_MAX_TELEOP_FORCE_SCALE:g}"
-            raise DrakeTeleopError(what, where=name, remedy="give a scale, such as 0 or 1")
+            raise DrakeTeleopError(what, where=name, remedy="give a force scale, such as 0 or 1")
     sigma, kept, gamma, *separate = given_scales.values()
     if kept is not None and not has_gripper:
         what = "sigma_object requires a gripper"

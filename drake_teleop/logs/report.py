@@ -63,15 +63,15 @@ def parameter_rows(load: Identification) -> list[ParameterRow]:
 
 def write_report(
     path: Path,
-    found: IdentifiedLog,
+    identified: IdentifiedLog,
     summary: Mapping[str, Any],
     object_load: Identification | None = None,
 ) -> None:
-    """Write the HTML report of an identification, including fit.png and knowledge.png beside it.
+    """Write the HTML report of an identification, with pictures fit.png and knowledge.png.
 
     `object_load` is the load of the object alone, if the gripper is known.
     """
-    log, result = found.log, found.identification
+    log, result = identified.log, identified.identification
     text = (
         "About the origin of the sensor frame S, in its axes. The intervals contain the true value"
         " in 95 of 100 records, if the residual is noise. Parameters that the record does not"
@@ -106,7 +106,7 @@ def write_report(
         tiles=_summary_tiles(result),
         notes=summary["notes"],
         tables=tables,
-        determined=found.base_parameters.text_lines(),
+        determined=identified.base_parameters.text_lines(),
         figures=[
             ("Fit", png_data_url(path.parent / "fit.png"), fit),
             ("Residual, intervals and identifiability", picture, identifiability),

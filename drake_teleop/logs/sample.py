@@ -47,7 +47,7 @@ _LINK_TWISTS_RAD = np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0
 HOME_ANGLES_RAD = np.array([0.3, -1.7, 1.9, -1.8, -1.5, 0.4])  # gripper down, in front of the arm
 _FOURIER_AMPLITUDES_RAD = np.array([0.8, 0.4, 0.45, 1.0, 1.0, 1.3])
 _NUM_MOTION_HARMONICS = 6
-TRUE_PHI = phi_from_mass_com_inertia(TRUE_MASS_KG, TRUE_COM_S, TRUE_INERTIA_COM)
+TRUE_LOAD = phi_from_mass_com_inertia(TRUE_MASS_KG, TRUE_COM_S, TRUE_INERTIA_COM)
 """Load phi (10,) of the gripper."""
 
 
@@ -116,7 +116,7 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
         load = {"mass": TRUE_MASS_KG, "com": TRUE_COM_S, "inertia_com": TRUE_INERTIA_COM}
         offsets = {"offsets": TRUE_SENSOR_OFFSETS[0], "offsets_touched": TRUE_SENSOR_OFFSETS[1]}
         contacts = [_summarize_true_contact(touch) for touch in FINGERTIP_PUSHES]
-        truth = {**load, "phi": TRUE_PHI, **offsets, "delay_s": POSE_DELAY_S, "contacts": contacts}
+        truth = {**load, "phi": TRUE_LOAD, **offsets, "delay_s": POSE_DELAY_S, "contacts": contacts}
         write_json(out / "truth.json", truth)
         duration_s = MOTION_PERIOD_S + 2 * REST_AT_ENDS_S
         summary = {"seed": seed, "files": [*files, "truth.json"], "duration_s": duration_s}
@@ -162,7 +162,7 @@ def _motion_of_record(number: int) -> Callable[[Array], _Motion]:
 def _random_motion(
     random: np.random.Generator, scale: float, harmonics: int, period_s: float, rest_s: float
 ) -> Callable[[Array], _Motion]:
-    """Return a function of times [s]: `sensor_motion` of a random path between two rests."""
+    """Return the motion, as a function of times [s], of a random Fourier path between two rests."""
     sine, cosine = (
         random.normal(size=(2, 6, harmonics - 1)) * scale * _FOURIER_AMPLITUDES_RAD[:, np.newaxis]
     )
@@ -202,7 +202,7 @@ def _write_record(
 
     t, motion_at = _jittered_time_stamps(WRENCH_HZ, random), _motion_of_record(row)
     s, omega, alpha, R_WS, _ = motion_at(t)
-    wrench = non_contact_wrench(s, omega, alpha, TRUE_PHI) + TRUE_SENSOR_OFFSETS[row]
+    wrench = non_contact_wrench(s, omega, alpha, TRUE_LOAD) + TRUE_SENSOR_OFFSETS[row]
     for touch in pushes:
         wrench -= touch.wrench_S(t, R_WS)  # the push reduces the wrench of the sensor on the load
     wrench += WRENCH_NOISE_STD * random.normal(size=wrench.shape)
@@ -222,7 +222,7 @@ def _write_columns(path: Path, names: str, columns: list[Array]) -> None:
     write_table(path, pl.DataFrame(table, schema=names.split()), float_precision=4)
 
 
-_POSE_NOISE_STD = np.repeat([5e-5, 2e-4], 3)  # m, rad
+_POSE_NOISE_STD_M_AND_RAD = np.repeat([5e-5, 2e-4], 3)  # m, rad
 _EPISODE_HARMONICS, _EPISODE_REST_S = 5, 0.2
 _MIN_CONTACT_FORCE_N = 0.5
 
@@ -247,7 +247,7 @@ def sample_episode(
     fps: float = 30.0,
     duration_s: float = 6.0,
     seed: int = 0,
-    phi: Array = TRUE_PHI,
+    phi: Array = TRUE_LOAD,
     contacts: int = 2,
     lag_frames: float = 0.0,
 ) -> SampleEpisode:
@@ -273,7 +273,7 @@ def sample_episode(
     wrench = non_contact_wrench(s, omega, alpha, phi) + contact + offsets
     wrench += WRENCH_NOISE_STD * random.normal(size=wrench.shape)
     *_, R_late, p_late = motion_at(t - lag_frames / fps)
-    noise = _POSE_NOISE_STD * random.normal(size=(len(t), 6))
+    noise = _POSE_NOISE_STD_M_AND_RAD * random.normal(size=(len(t), 6))
     turned = Rotation.from_matrix(R_late) * Rotation.from_rotvec(noise[:, 3:])
     quaternion = turned.as_quat()[:, [3, 0, 1, 2]]
     touched = np.linalg.norm(contact[:, :3], axis=1) > _MIN_CONTACT_FORCE_N

@@ -88,20 +88,20 @@ def notes_on_grasped_object(object_load: Identification) -> list[str]:
     return ["the object's parameters are physically consistent only within their uncertainty"]
 
 
-def summarize_wrenches(found: EliminatedLog) -> dict[str, Any]:
+def summarize_wrenches(eliminated: EliminatedLog) -> dict[str, Any]:
     """Return RMS and peak of |force|, |torque| and each channel; ends and gaps are excluded."""
     figures: dict[str, Any] = {}
     for name, suffix, wrench in (
-        ("raw", "rms", found.measured),
-        ("gravity_only", "rms", found.gravity_only),
-        ("residual", "rms", found.contact),
-        ("residual", "peak", found.contact),
+        ("raw", "rms", eliminated.measured),
+        ("gravity_only", "rms", eliminated.gravity_only),
+        ("residual", "rms", eliminated.contact),
+        ("residual", "peak", eliminated.contact),
     ):
         keys = (f"{name}_{suffix}", f"{name}_torque_{suffix}", f"{name}_{suffix}_per_channel")
         figures |= dict.fromkeys(keys)
         if wrench is None:
             continue
-        x = wrench[~found.edge]
+        x = wrench[~eliminated.edge]
         parts = np.linalg.norm(x[:, :3], axis=1), np.linalg.norm(x[:, 3:], axis=1), x
         peaks = (np.abs(part).max(axis=0) for part in parts)
         rms = (np.sqrt(np.mean(part**2, axis=0)) for part in parts)
@@ -120,7 +120,7 @@ def summarize_detected_contact(found: EliminatedLog, causal_tare_s: float | None
         figures["contacts"] = summarize_contacts(found.log.t, found.contact, found.touched)
         figures["in_contact"] = found.touched.mean()
     if found.causal is not None:
-        late, contact = found.causal.contact[~found.edge], found.contact[~found.edge]
+        late, contact = (found.causal.contact[~found.edge], found.contact[~found.edge])
 
         def rms_of_wrench(name: str, wrench: Array) -> dict[str, float]:
             force, torque = np.sqrt(np.mean(wrench**2, axis=0).reshape(2, 3).sum(axis=1))
@@ -138,15 +138,15 @@ def summarize_detected_contact(found: EliminatedLog, causal_tare_s: float | None
     return figures
 
 
-def shares_of_samples_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
-    """Return shares of samples with |F| > `threshold` [N]: tared, without weight, without load."""
+def shares_of_samples_above_force(eliminated: EliminatedLog, threshold: float) -> dict[str, Any]:
+    """Return shares of samples with |F| > `threshold` [N], for three stages of load removal."""
     wrenches = {
-        "raw": found.measured - found.measured[0],
-        "gravity_only": found.gravity_only,
-        "eliminated": found.contact,
+        "raw": eliminated.measured - eliminated.measured[0],
+        "gravity_only": eliminated.gravity_only,
+        "eliminated": eliminated.contact,
     }
 
     def share_above(wrench: Array) -> float:
-        return float((np.linalg.norm(wrench[~found.edge, :3], axis=1) > threshold).mean())
+        return float((np.linalg.norm(wrench[~eliminated.edge, :3], axis=1) > threshold).mean())
 
     return {name: None if w is None else share_above(w) for name, w in wrenches.items()}

@@ -20,7 +20,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.load import tolerance as tolerances
 from drake_teleop.load.normal_equations import SecondMoments
 from drake_teleop.load.regressor import regressor
-from drake_teleop.logs.causes.cause import STEP_CHANGES
+from drake_teleop.logs.causes.cause import CHANGE_CAUSES
 from drake_teleop.logs.processing import IdentifiedLog, identify_log
 from drake_teleop.logs.read.alignment import low_pass_log
 from drake_teleop.logs.read.reading import read_log
@@ -99,7 +99,7 @@ def evaluate_record(
         if load.mass > 0.0:
             phi, noise = load.phi, np.maximum(load.residual_rms, 1e-3 * _ASSUMED_WRENCH_NOISE)
     known = sure & (previous is not None and previous.is_within_tolerance)
-    changes = [x.start_s or 0.0 for x in found.causes if x.name in STEP_CHANGES] if found else []
+    changes = [x.start_s or 0.0 for x in found.causes if x.name in CHANGE_CAUSES] if found else []
     with suppress(DrakeTeleopError):  # too few samples
         log = log or low_pass_log(read_log(path, bandwidth_hz=cutoff_hz), cutoff_hz)
     if log is None:

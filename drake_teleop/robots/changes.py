@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.causes.cause import STEP_CHANGES, Finding, name_misfit_causes
+from drake_teleop.logs.causes.cause import CHANGE_CAUSES, Finding, list_misfit_causes
 from drake_teleop.logs.causes.explain import explain_misfit
+from drake_teleop.logs.causes.fitted_model import FittedModel
 from drake_teleop.logs.causes.instants import SPECIFIC_FORCE_SIGNALS, block_means_of_record
 from drake_teleop.logs.causes.model import StepChange
-from drake_teleop.logs.causes.state import FittedModel
 from drake_teleop.robots import streams
 from drake_teleop.robots.compensator import MIN_CLOCK_JUMP_S
 
@@ -115,18 +115,18 @@ def find_zero_and_load_changes(rows: Array, dt: float) -> list[TimedChangeText]:
         return []
     wrench, *motion = np.split(rows[at, 1:], [6, 9, 12], axis=1)
     lost = np.abs(rows[at, 0] - t) > dt
-    state = explain_misfit(block_means_of_record(t, wrench, tuple(motion), None, lost)).state
+    state = explain_misfit(block_means_of_record(t, wrench, tuple(motion), None, lost)).fit
     return [
         (cause.start_s, _text_of_zero_or_load_change(cause))
-        for cause in name_misfit_causes(state)
-        if cause.name in STEP_CHANGES
+        for cause in list_misfit_causes(state)
+        if cause.name in CHANGE_CAUSES
         and cause.start_s is not None
         and _is_change_kind_certain(state, cause.start_s)
     ]
 
 
 def _is_change_kind_certain(state: FittedModel, time: float) -> bool:
-    steps, data = state.model.steps, state.data
+    steps, data = state.model.steps, state.means
     after = data.y[data.used & (data.t > time)][:, SPECIFIC_FORCE_SIGNALS]
     min_std = _MIN_SPECIFIC_FORCE_STD_AFTER_CHANGE_M_S2
     if len(after) == 0 or np.linalg.norm(after.std(axis=0)) < min_std:

@@ -16,7 +16,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import move_earlier_recordings, refuse_to_replace_inputs
 from drake_teleop.common.interruption import INTERRUPTED_EVENT, raise_interrupt_on_sigint
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.causal import filter_lag
+from drake_teleop.logs.causal import low_pass_delay_s
 from drake_teleop.logs.processing import notes_on_undetermined_load
 from drake_teleop.robots.assembly import ReadingAssembler
 from drake_teleop.robots.changes import ZeroAndLoadMonitor
@@ -131,7 +131,7 @@ def run_compensate_command(
             remedy = "end this command, and start it with the other load"
             raise DrakeTeleopError(what, where="load", remedy=remedy)
         dt, delay_readings = readings.dt, getattr(readings, "delay_readings", 0)
-        ahead_s = delay_readings * dt + filter_lag(dt, cutoff_hz) if predicted else 0.0
+        ahead_s = delay_readings * dt + low_pass_delay_s(dt, cutoff_hz) if predicted else 0.0
         stream = dt, cutoff_hz, options.get("delay", "auto"), ahead_s
         detector = None if free is None else StreamContactDetector(load, free, *stream)
         input_files.extend(() if detector is None else detector.files)

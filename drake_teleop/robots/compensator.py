@@ -15,7 +15,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.load.compensation import unknown_gravity_error
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs import processing
-from drake_teleop.logs.causal import filter_lag, low_pass_and_settled_state
+from drake_teleop.logs.causal import low_pass_coefficients, low_pass_delay_s
 from drake_teleop.robots import compensation_step as kernel
 from drake_teleop.robots.streams import (
     NONZERO_WRENCH_FLAGS,
@@ -113,10 +113,10 @@ class Compensator:
         self._scales, self._is_gravity_known = np.empty(4), True
         self.set_scales(**scales)
         self.offsets = load.offsets.copy()
-        self.lag_s = delay_readings * dt + filter_lag(dt, cutoff_hz)
+        self.lag_s = delay_readings * dt + low_pass_delay_s(dt, cutoff_hz)
         self._watch, self._detector = watch, detector
         ahead = self.lag_s if predicted else 0.0
-        self._low_pass = low_pass_and_settled_state(dt, cutoff_hz, ahead)
+        self._low_pass = low_pass_coefficients(dt, cutoff_hz, ahead)
         self._range = np.full(6, np.inf) if sensor_range is None else np.array(sensor_range, float)
         self._largest = _MAX_ABS_READING_VALUES_SI.copy()
         self._largest[:6] = np.minimum(self._largest[:6], 2.0 * self._range)
@@ -174,7 +174,7 @@ class Compensator:
 
     def _require_known_weight(self) -> None:
         if self._weight_removed:
-            raise processing.weight_scale_without_effect_error("load")
+            raise processing.useless_weight_scale_error("load")
         if not self._is_gravity_known:
             remedy = "use a source with poses or joint positions, or sigma alone"
             raise unknown_gravity_error("gravity in the sensor frame", remedy)

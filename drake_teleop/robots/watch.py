@@ -16,7 +16,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.load.online import watched
 from drake_teleop.load.online.change import change_detector_parameters
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.causal import causal_low_pass, low_pass_and_settled_state
+from drake_teleop.logs.causal import causal_low_pass, low_pass_coefficients
 from drake_teleop.logs.processing import phi_with_inertia_replaced
 from drake_teleop.robots.compensation_step import low_pass_into
 from drake_teleop.robots.replay_log import ReplayLogSource
@@ -98,8 +98,8 @@ class StreamContactDetector:
             what = f"has readings at {1.0 / source.dt:.4g} Hz, but the stream at {1.0 / dt:.4g} Hz"
             remedy = "use the log that `calibrate` wrote from this stream"
             raise DrakeTeleopError(what, where=str(free), remedy=remedy)
-        self._fast = low_pass_and_settled_state(dt, cutoff_hz)
-        self._slow = low_pass_and_settled_state(dt, _GRAVITY_CUTOFF_HZ)
+        self._fast = low_pass_coefficients(dt, cutoff_hz)
+        self._slow = low_pass_coefficients(dt, _GRAVITY_CUTOFF_HZ)
         readings = [each for each in source.read(0.0) or () if not each.flags]
         values = np.array([each.values for each in readings]).reshape(-1, 15)
         transient = round(0.5 / (_GRAVITY_CUTOFF_HZ * dt))  # of the low-passes

@@ -12,7 +12,7 @@ from test_causes_model import GRAVITY_W, OFFSETS, SWAPPED, T, moving, record
 
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causes.candidates import fit_candidates
-from drake_teleop.logs.causes.cause import loads_between_changes, name_misfit_causes
+from drake_teleop.logs.causes.cause import list_misfit_causes, loads_between_changes
 from drake_teleop.logs.causes.changes import (
     add_step_change,
     find_contact_spans,
@@ -20,9 +20,9 @@ from drake_teleop.logs.causes.changes import (
     replace_steps_by_contact,
 )
 from drake_teleop.logs.causes.explain import _refit_with_shifted_motion
+from drake_teleop.logs.causes.fitted_model import FittedModel, score_statistic
 from drake_teleop.logs.causes.instants import block_means_of_record
 from drake_teleop.logs.causes.model import DELAY_INDEX, LoadModel, StepChange
-from drake_teleop.logs.causes.state import FittedModel, score_statistic
 
 LOAD = np.array([0.5, 0.01, -0.02, 0.03, *np.zeros(6)])
 
@@ -31,9 +31,9 @@ def state_of(model: LoadModel, values: list[float], spans: tuple = ()) -> Simple
     x = np.concatenate([OFFSETS, PHI, [0.0], values])
     covariance = np.diag(1e-6 * np.arange(1.0, len(x) + 1))
     data = record(np.zeros((len(T), 6)))
-    state = SimpleNamespace(model=model, x=x, covariance=covariance, data=data, contact_spans=spans)
-    state.parameters_of_extension = partial(FittedModel.parameters_of_extension, state)
-    return state
+    fit = SimpleNamespace(model=model, x=x, covariance=covariance, means=data, contact_spans=spans)
+    fit.parameters_of_extension = partial(FittedModel.parameters_of_extension, fit)
+    return fit
 
 
 @pytest.mark.parametrize(
@@ -68,12 +68,12 @@ def state_of(model: LoadModel, values: list[float], spans: tuple = ()) -> Simple
     ],
 )  # fmt: skip
 def test_a_cause_has_its_figures_with_intervals_of_95_percent(model, values, name, figures, words):
-    (cause,) = name_misfit_causes(state_of(model, values))
+    (cause,) = list_misfit_causes(state_of(model, values))
     assert cause.name == name and words in cause.message
     for key, value in figures.items():
         found = cause.values[key]
         assert found == (value if key == "axes" else pytest.approx(value, abs=1e-3))
-    given = name_misfit_causes(state_of(model, values), always_fitted=model.extensions)
+    given = list_misfit_causes(state_of(model, values), always_fitted=model.extensions)
     assert bool(given) != bool(model.extensions)
 
 
@@ -84,10 +84,10 @@ def test_a_cause_has_its_figures_with_intervals_of_95_percent(model, values, nam
 def test_contacts_are_listed_unless_a_hand_changes_the_load(span, shown):
     steps = (StepChange("load", 103.0), StepChange("offsets", 105.0))
     values = [*LOAD, 1.0, *np.zeros(5)]
-    state = state_of(LoadModel(steps=steps), values, (span,))
-    found = name_misfit_causes(state)
+    fit = state_of(LoadModel(steps=steps), values, (span,))
+    found = list_misfit_causes(fit)
     contacts = [(x.start_s, x.stop_s) for x in found if x.name == "contact"]
-    margin = state.data.dt
+    margin = fit.means.dt
     assert contacts == ([(span[0] + margin, span[1] - margin)] if shown else [])
     starts = [x.start_s for x in found]
     assert starts == sorted(starts) and {103.0, 105.0} <= set(starts)
@@ -96,9 +96,9 @@ def test_contacts_are_listed_unless_a_hand_changes_the_load(span, shown):
 def test_load_of_each_part_includes_the_uncertainty_of_earlier_changes():
     steps = (StepChange("load", 104.0), StepChange("offsets", 101.0), StepChange("load", 102.0))
     values = [*(2.0 * LOAD), *np.ones(6), *LOAD]
-    state = state_of(LoadModel(steps=steps), values)
-    covariance = 4.0 * state.covariance[:16, :16]
-    parts = loads_between_changes(state, covariance)
+    fit = state_of(LoadModel(steps=steps), values)
+    covariance = 4.0 * fit.covariance[:16, :16]
+    parts = loads_between_changes(fit, covariance)
     assert [(x.start_s, x.stop_s) for x in parts] == [
         (pytest.approx(a), pytest.approx(b))
         for a, b in ((100.0, 102.0), (102.0, 104.0), (104.0, T[-1]))
@@ -126,12 +126,12 @@ def test_delay_of_a_model_is_removed_up_to_300_ms(before, moves, late):
     def with_delay(delay: float):
         return block_means_of_record(T, wrench, moving(T + delay - before - late), GRAVITY_W)
 
-    state = FittedModel.fit_record(with_delay(before), LoadModel())
-    assert state.x[DELAY_INDEX] == pytest.approx(late, abs=1e-3)
-    after, delay = _refit_with_shifted_motion(state, before, with_delay)
+    fit = FittedModel.fit_record(with_delay(before), LoadModel())
+    assert fit.x[DELAY_INDEX] == pytest.approx(late, abs=1e-3)
+    after, delay = _refit_with_shifted_motion(fit, before, with_delay)
     assert delay == (pytest.approx(before + late, abs=5e-4) if moves else before)
     assert (abs(after.x[DELAY_INDEX]) < 5e-4) == moves
-    assert _refit_with_shifted_motion(state, before, None) == (state, before)
+    assert _refit_with_shifted_motion(fit, before, None) == (fit, before)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e2])
@@ -159,10 +159,8 @@ def test_gradual_change_is_at_the_middle_of_its_ramp(kinds, guess):
     wrench += share * ("load" in kinds) * non_contact_wrench(s, omega, alpha, load)
     wrench += share * ("offsets" in kinds) * step
     wrench += np.repeat([1e-2, 1e-3], 3) * np.random.default_rng(0).normal(size=wrench.shape)
-    state = FittedModel.fit_record(
-        record(wrench), LoadModel(steps=(StepChange("offsets", 100.99),))
-    )
-    found = fit_steps_at_middle_of_ramps(state, [kinds], [guess], ((100.5, 100.6),))
+    fit = FittedModel.fit_record(record(wrench), LoadModel(steps=(StepChange("offsets", 100.99),)))
+    found = fit_steps_at_middle_of_ramps(fit, [kinds], [guess], ((100.5, 100.6),))
     assert found.contact_spans == ((100.5, 100.6), (guess - 0.25, guess + 0.25))
     assert [x.kind for x in found.model.steps] == ["offsets", *kinds]
     assert found.model.steps[0].time == 100.99
@@ -184,18 +182,22 @@ def test_contact_spans_cover_the_contact_and_cost_two_numbers_an_end(
     wrench += np.repeat([0.02, 2e-3], 3) * np.random.default_rng(1).normal(size=wrench.shape)
     touched = ((start < T) & (stop > T))[:, None]
     wrench += touched * [8.0, 0.0, 5.0, 0.3, 0.0, 0.0] * (1.0 + np.sin(3.0 * T[:, None]))
-    state = FittedModel.fit_record(record(wrench), LoadModel())
-    ((found_start, found_stop),) = find_contact_spans(state)
+    fit = FittedModel.fit_record(record(wrench), LoadModel())
+    ((found_start, found_stop),) = find_contact_spans(fit)
     assert max(start, T[0] - 0.02) - 0.7 < found_start <= max(start, T[0])
     assert min(stop, T[-1]) <= found_stop < min(stop, T[-1]) + 0.7
-    for name in ("_fit_extension", "_torque_factor_candidates", "_axis_permutation_candidates"):
+    for name in (
+        "_fit_with_extension",
+        "_torque_factor_candidates",
+        "_axis_permutation_candidates",
+    ):
         monkeypatch.setattr(f"drake_teleop.logs.causes.candidates.{name}", lambda *_: iter(()))
     monkeypatch.setattr("drake_teleop.logs.causes.candidates.add_step_change", lambda *_: None)
     monkeypatch.setattr("drake_teleop.logs.causes.candidates._MIN_CHANNEL_GAIN_ERROR", 1.0)
-    (contact,) = fit_candidates(state, True)
-    price = (6 + 2 * ends) * np.log(state.data.used.sum())
-    gain = 2.0 * (contact.state.log_likelihood - state.log_likelihood)
-    assert contact.name == "contact" and contact.state.contact_spans == ((found_start, found_stop),)
+    (contact,) = fit_candidates(fit, True)
+    price = (6 + 2 * ends) * np.log(fit.means.used.sum())
+    gain = 2.0 * (contact.fit.log_likelihood - fit.log_likelihood)
+    assert contact.name == "contact" and contact.fit.contact_spans == ((found_start, found_stop),)
     assert contact.score == pytest.approx(gain - price)
 
 
@@ -244,6 +246,6 @@ def test_steps_at_the_ends_of_a_record_are_no_changes(at: float) -> None:
     plain = FittedModel.fit_record(record(wrench), LoadModel())
     found = add_step_change(plain, "offsets")
     assert all(T[0] + 0.2 < time < T[-1] - 0.2 for time in (found or plain).model.step_times)
-    state = FittedModel.fit_record(plain.data, LoadModel(steps=(StepChange("offsets", step),)))
-    for span in replace_steps_by_contact(state).contact_spans:
+    fit = FittedModel.fit_record(plain.means, LoadModel(steps=(StepChange("offsets", step),)))
+    for span in replace_steps_by_contact(fit).contact_spans:
         assert span[1] - span[0] < 0.5 * (T[-1] - T[0])

@@ -12,6 +12,12 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs import explained_log
 from drake_teleop.logs.causes.candidates import Candidate
+from drake_teleop.logs.causes.fitted_model import (
+    UsedRows,
+    fit_model,
+    is_in_time_spans,
+    regularized_inverse,
+)
 from drake_teleop.logs.causes.instants import (
     WRENCH_SIGNALS,
     BlockMeans,
@@ -23,12 +29,6 @@ from drake_teleop.logs.causes.intervals import (
     widening_factor_by_misfit,
 )
 from drake_teleop.logs.causes.model import DELAY_INDEX, LoadModel, StepChange
-from drake_teleop.logs.causes.state import (
-    UsedRows,
-    fit_model,
-    is_in_time_spans,
-    regularized_inverse,
-)
 
 GRAVITY_W = np.array([0.4, -0.3, -9.79])
 OFFSETS = np.array([3.0, -2.0, 5.0, 0.3, -0.2, 0.1])
@@ -101,7 +101,7 @@ def test_coefficients_of_a_cause_give_the_wrench_that_the_sensor_reads(name, siz
     np.testing.assert_allclose(left, 0.0, atol=1e-9)
     move = 1e-6 * np.random.default_rng(1).normal(size=model.size)
     change = model.residual_coefficients(x + move) - model.residual_coefficients(x - move)
-    expected = -2.0 * np.tensordot(move, model.wrench_derivative(x), 1)
+    expected = -2.0 * np.tensordot(move, model.wrench_jacobian(x), 1)
     np.testing.assert_allclose(change, expected, atol=1e-9)
     assert model.start_parameters(x, LoadModel())[: DELAY_INDEX + 1] == pytest.approx(
         x[: DELAY_INDEX + 1]
@@ -293,10 +293,10 @@ def test_rows_within_spans_are_marked():
 def test_deviations_widen_with_the_scatter_of_parts_and_with_a_smooth_misfit(
     ratio, smooth, parts, factor
 ):
-    state = SimpleNamespace(
+    fit = SimpleNamespace(
         covariance=1e-12 * np.eye(40),
         model=SimpleNamespace(extensions=parts),
         smooth_misfit=smooth,
         x=np.concatenate([OFFSETS, PHI]),
     )
-    assert widening_factor_by_misfit(state, np.full(16, ratio * 1e-6)) == pytest.approx(factor)
+    assert widening_factor_by_misfit(fit, np.full(16, ratio * 1e-6)) == pytest.approx(factor)

@@ -20,7 +20,7 @@ from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.explained_log import (
     _correct_wrench_unit_or_torque_scale,
-    add_description_lines,
+    add_corrected_fields,
     implausible_mass_message,
 )
 from drake_teleop.logs.processing import IdentifiedLog, check_log, identify_log
@@ -281,7 +281,7 @@ def test_lines_of_axes_factor_and_gain_compose_with_the_description(
     scales = rng.choice([-2.0, 1e-4, 1.0], (2, 3))
     record.described(int(rng.choice([-1, 1])), frame, *scales)
     path = record.write(tmp_path)
-    follow(path, add_description_lines(causes, read_log(path), by_pose=True))
+    follow(path, add_corrected_fields(causes, read_log(path), by_pose=True))
     assert read_log(path).wrench == pytest.approx(right, rel=1e-5, abs=1e-4)
 
 
@@ -294,7 +294,7 @@ def test_line_of_a_wrong_clock_rate_has_six_digits(
     lines = {"time": {"column": "t", "scale": scale}}
     record.wrench_lines = record.pose_lines = record.imu_lines = lines
     log = read_log(record.write(tmp_path))
-    [cause] = add_description_lines(
+    [cause] = add_corrected_fields(
         [Finding("clock rate", "c", values={"ratio": ratio})], log, by_pose=True
     )
     assert set(cause.fields) == {f"{name}.time.scale" for name in ("wrench", "imu", "pose")}
@@ -336,7 +336,7 @@ def test_remedy_adds_the_weight_and_composes_the_pose_frame(seed: int, tmp_path:
     record.pose_lines = {"position_in_sensor": known.tolist()}
     causes = [Finding("pose frame", "r", values={"position_in_sensor": shift.tolist()})]
     path = record.write(tmp_path)
-    follow(path, add_description_lines(causes, read_log(path), by_pose=True))
+    follow(path, add_corrected_fields(causes, read_log(path), by_pose=True))
     log = read_log(path)
     assert log.posed is not None
     assert log.posed.poses.position == pytest.approx(place, abs=2e-5)
@@ -362,13 +362,13 @@ def test_a_canonical_table_and_base_axes_get_other_remedies(tmp_path: Path) -> N
     record = Record.simulate(seconds=1.0)
     cause = Finding("axes", "D", values={"matrix": PERMUTATIONS[14].tolist()})
     log = read_log(record.write(tmp_path))
-    [of_table] = add_description_lines([cause], replace(log, source="log.csv"), by_pose=True)
+    [of_table] = add_corrected_fields([cause], replace(log, source="log.csv"), by_pose=True)
     assert "in a log description of this table" in of_table.message
     record.wrench_lines = {"frame": "base"}
-    [of_base] = add_description_lines([cause], read_log(record.write(tmp_path)), by_pose=True)
+    [of_base] = add_corrected_fields([cause], read_log(record.write(tmp_path)), by_pose=True)
     assert of_base.message == "D; correct the columns of wrench.force and wrench.torque"
     inverted = Finding("axes", "D", values={"matrix": (-np.eye(3)).tolist()})
-    [of_sign] = add_description_lines([inverted], read_log(record.write(tmp_path)), by_pose=True)
+    [of_sign] = add_corrected_fields([inverted], read_log(record.write(tmp_path)), by_pose=True)
     assert of_sign.message == "D; set wrench.sign: -1"
 
 
@@ -427,7 +427,7 @@ def test_inspect_and_repeated_fits_accept_a_removed_weight(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("lines", "said"),
     [
-        ({"wrench": {"force": {"scale": 0}}}, "must have absolute values of at least 1e-12"),
+        ({"wrench": {"force": {"scale": 0}}}, "scale factor is below 1e-12 in magnitude"),
         ({"wrench": {"force": {"scale": [1, 2]}}}, "scale"),
         ({"wrench": {"force": {"scale": ".inf"}}}, "scale"),
         ({"wrench": {"weight": "gone"}}, "must be the word removed, or"),

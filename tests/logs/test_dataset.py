@@ -35,7 +35,7 @@ from drake_teleop.logs.dataset.episode_verdict import (
 from drake_teleop.logs.dataset.shared_load import find_shared_load
 from drake_teleop.logs.pose_motion.poses import Poses, PosesOfLog
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.sample import TRUE_PHI, WRENCH_NOISE_STD, SampleEpisode, sample_episode
+from drake_teleop.logs.sample import TRUE_LOAD, WRENCH_NOISE_STD, SampleEpisode, sample_episode
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from sample_dataset import write_sample_dataset
@@ -56,9 +56,9 @@ def verdict(x: SampleEpisode) -> set[str]:
     fps = 1.0 / (x.t[1] - x.t[0])
     signals = EpisodeSignals(log_of(x))
     found, residual = find_simplest_hypothesis_and_residual(
-        signals, TRUE_PHI, 0.0, 0.8 * WRENCH_NOISE_STD
+        signals, TRUE_LOAD, 0.0, 0.8 * WRENCH_NOISE_STD
     )
-    names = {f.name for f in list_faults(found, 0.0, TRUE_PHI, fps) + saturation_faults(x.wrench)}
+    names = {f.name for f in list_faults(found, 0.0, TRUE_LOAD, fps) + saturation_faults(x.wrench)}
     step = find_offset_step(residual, found.spread)
     return names | ({"tared"} if step is not None else set())
 
@@ -71,8 +71,8 @@ def test_shared_load_is_uncertain_by_its_noise_and_the_level_has_its_own_thresho
     )
     assert found.threshold == pytest.approx(max(6.2, 1.1 * floor.free_maxima[0]))
     assert floor.free_maxima[0] < 0.9 * floor.free_maxima.max()
-    error = found.phi[0] - TRUE_PHI[0]
-    assert abs(error) < 5.0 * load.standard_deviations[6] + 0.01 * TRUE_PHI[0]
+    error = found.phi[0] - TRUE_LOAD[0]
+    assert abs(error) < 5.0 * load.standard_deviations[6] + 0.01 * TRUE_LOAD[0]
 
 
 def mapped(M: Any, force: float = 1.0, torque: float = 1.0) -> Callable[..., SampleEpisode]:
@@ -150,7 +150,9 @@ def test_any_large_rotation_of_the_wrench_is_found(
     R = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
     x = mapped(R)(sample_episode(number, contacts=1))
     signals = EpisodeSignals(log_of(x))
-    found, _ = find_simplest_hypothesis_and_residual(signals, TRUE_PHI, 0.0, 0.8 * WRENCH_NOISE_STD)
+    found, _ = find_simplest_hypothesis_and_residual(
+        signals, TRUE_LOAD, 0.0, 0.8 * WRENCH_NOISE_STD
+    )
     assert np.degrees(Rotation.from_matrix(found.axes[0] @ R.T).magnitude()) < 3.0
 
 
@@ -181,7 +183,7 @@ def test_lerobot_copy_has_contact_wrenches_and_the_same_other_bytes(tmp_path: Pa
     assert [row["verdict"] for row in summary["episodes"]] == [
         *(["ok"], ["ok"], ["sign", "frame"], ["ok"])
     ]
-    assert summary["mass"] == pytest.approx(TRUE_PHI[0], rel=5e-3)
+    assert summary["mass"] == pytest.approx(TRUE_LOAD[0], rel=5e-3)
     assert files_of(source) == before
     data = "data/chunk-000/file-000.parquet"
     old, new = (pl.read_parquet(folder / data) for folder in (source, tmp_path / "out" / "demo"))
@@ -469,7 +471,7 @@ def key_of_interrupted_run(folder: Path, load: Path, description: Any = LEROBOT)
 
 def identification(**changes: Any) -> Identification:
     covariance = np.eye(16) * 1e-8
-    known = {"phi": TRUE_PHI, "offsets": np.zeros(6), "covariance": covariance} | changes
+    known = {"phi": TRUE_LOAD, "offsets": np.zeros(6), "covariance": covariance} | changes
     numbers = np.ones(16, bool), 1.0, 0.0, np.ones(6), "test", 100
     return Identification(*known.values(), *numbers)
 
@@ -529,7 +531,7 @@ def test_shared_load_has_the_usual_delay_and_is_uncertain_by_gain_errors() -> No
     assert plain.delay_s == pytest.approx(2.0 / 30.0, abs=0.15 / 30.0)
     np.testing.assert_array_equal(plain.phi, widened.phi)
     increase = widened.standard_deviations[6] - plain.standard_deviations[6]
-    assert 0.6 < increase / (0.05 * TRUE_PHI[0]) < 1.1
+    assert 0.6 < increase / (0.05 * TRUE_LOAD[0]) < 1.1
     assert (widened.standard_deviations[7:10] > 5.0 * plain.standard_deviations[7:10]).all()
 
 

@@ -15,13 +15,13 @@ from drake_teleop.logs.dataset.episode_verdict import (
     EpisodeSignals,
     WrenchHypothesis,
     _weighted_number_of_faults,
+    fault_free_hypothesis,
     find_offset_step,
-    hypothesis_without_fault,
-    ln_half_width_and_centre_of_calm_half,
+    ln_half_width_and_centre,
 )
-from drake_teleop.logs.sample import TRUE_PHI, sample_episode
+from drake_teleop.logs.sample import TRUE_LOAD, sample_episode
 
-PLAIN, I3 = hypothesis_without_fault(2.0), np.eye(3)
+PLAIN, I3 = fault_free_hypothesis(2.0), np.eye(3)
 QUARTER = Rotation.from_euler("y", 90, degrees=True).as_matrix()
 SKEW = Rotation.from_euler("y", 30, degrees=True).as_matrix()
 FLIP = np.diag([1.0, -1.0, 1.0])
@@ -50,11 +50,11 @@ FLIP = np.diag([1.0, -1.0, 1.0])
             ["torque is 8.85 times the value in N m: its unit is lbf in"],
         ),
         ({"gains": np.array([1.3, 1.0])}, ["the force is 1.3 times the value in N"]),
-        ({"phi": 2.0 * TRUE_PHI}, ["another one: "]),
+        ({"phi": 2.0 * TRUE_LOAD}, ["another one: "])
     ],
 )  # fmt: skip
 def test_findings_contain_figures_and_units(change, expected):
-    found = list_faults(replace(PLAIN, **change), 2.0, TRUE_PHI, 20.0)
+    found = list_faults(replace(PLAIN, **change), 2.0, TRUE_LOAD, 20.0)
     assert len(found) == len(expected)
     for finding, words in zip(found, expected, strict=True):
         assert words in finding.message
@@ -75,7 +75,7 @@ def test_findings_contain_figures_and_units(change, expected):
         ({"gains": np.array([2.0, 1.0])}, 1.0),
         ({"gains": np.array([1.0, 3.0])}, 1.0),
         ({"gains": np.array([2.0, 3.0]), "kind": "base"}, 3.0),
-        ({"phi": TRUE_PHI, "lag": 0.0}, 5.0),
+        ({"phi": TRUE_LOAD, "lag": 0.0}, 5.0),
     ],
 )
 def test_each_deviation_increases_the_cost(change, count):
@@ -95,7 +95,7 @@ def test_correct_is_the_inverse_of_apply(gain):
 def test_calm_half_is_the_narrowest_half_of_each_channel():
     """Five of 8 numbers are within 2 half widths: the half has 4 intervals."""
     x = np.array([5.0, 5.25, 5.5, 5.75, 6.0, 9.0, -20.0, 40.0])
-    spread, centres = ln_half_width_and_centre_of_calm_half(
+    spread, centres = ln_half_width_and_centre(
         np.column_stack([x, 3.0 - 2.0 * x, 0.0 * x]), np.full(3, 1e-3)
     )
     np.testing.assert_allclose(np.exp(spread), [0.5, 1.0, 1e-3])
@@ -112,7 +112,7 @@ def test_step_of_the_offsets_is_found_inside_the_episode(step, at, found, channe
     before = np.arange(6.0)
     residual = noise + before
     residual[at:, channel] += step
-    spread = ln_half_width_and_centre_of_calm_half(noise, np.zeros(6))[0]
+    spread = ln_half_width_and_centre(noise, np.zeros(6))[0]
     jump = find_offset_step(residual, spread)
     assert (jump is not None) == found
     if jump is not None:
@@ -143,15 +143,15 @@ def test_signals_of_an_episode_have_the_lag_and_the_axes_of_their_kind(lag):
     x = sample_episode(3)
     signals = EpisodeSignals(log_of(x))
     at = signals.motion(x.t + lag * (x.t[1] - x.t[0]))
-    w = signals.measured_and_load_wrench(TRUE_PHI, "sensor", lag)
+    w = signals.measured_and_load_wrench(TRUE_LOAD, "sensor", lag)
     np.testing.assert_array_equal(w[0], x.wrench)
-    expected = non_contact_wrench(at.s, at.omega, at.alpha, TRUE_PHI)
+    expected = non_contact_wrench(at.s, at.omega, at.alpha, TRUE_LOAD)
     np.testing.assert_allclose(w[1], expected, atol=1e-6)
-    np.testing.assert_allclose(signals.regressor_at_lag(lag) @ TRUE_PHI, expected, atol=1e-6)
-    weightless = signals.measured_and_load_wrench(TRUE_PHI, "weight removed", lag)[1]
-    weight = non_contact_wrench(-at.gravity, 0.0 * at.omega, 0.0 * at.alpha, TRUE_PHI)
+    np.testing.assert_allclose(signals.regressor_at_lag(lag) @ TRUE_LOAD, expected, atol=1e-6)
+    weightless = signals.measured_and_load_wrench(TRUE_LOAD, "weight removed", lag)[1]
+    weight = non_contact_wrench(-at.gravity, 0.0 * at.omega, 0.0 * at.alpha, TRUE_LOAD)
     np.testing.assert_allclose(weightless, expected - weight, atol=1e-6)
-    turned = signals.measured_and_load_wrench(TRUE_PHI, "base", lag)[0]
+    turned = signals.measured_and_load_wrench(TRUE_LOAD, "base", lag)[0]
     for part in (slice(0, 3), slice(3, 6)):
         back = np.einsum("nij,nj->ni", at.R_WS, turned[:, part])
         np.testing.assert_allclose(back, x.wrench[:, part], atol=2e-3)

@@ -318,7 +318,7 @@ def test_draft_of_a_bag_without_wrench_topic_has_a_placeholder(tmp_path: Path) -
         (
             "wrench",
             {"topic": None} | PLAIN,
-            ["run1", "no topic is specified", "`drake-teleop inspect` drafts"],
+            ["run1", "no topic of the bag is specified", "`drake-teleop inspect` drafts"],
         ),
         ("wrench", {"file": "none.mcap"}, ["none.mcap", "no such file"]),
         ("wrench", {"file": "log.yaml"}, ["the path is not a bag", "metadata.yaml"]),

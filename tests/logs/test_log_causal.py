@@ -13,7 +13,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.causal import causal_low_pass, compute_causal_wrench, filter_lag
+from drake_teleop.logs.causal import causal_low_pass, compute_causal_wrench, low_pass_delay_s
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.logs.read.reading import read_log
@@ -48,7 +48,7 @@ def test_ramp_has_the_stated_lag_or_is_predicted(delay: float, wait: int) -> Non
     ramp = np.outer(np.arange(0, 2, DT), [1.0, 2, 3, 4, 5, 6])
     options = {"cutoff_hz": CUTOFF, "delay_s": delay}
     late = compute_causal_wrench(ramp, 2 * ramp, DT, mode="delayed", **options)
-    assert late.lag_s == pytest.approx(wait * DT + filter_lag(DT, CUTOFF))
+    assert late.lag_s == pytest.approx(wait * DT + low_pass_delay_s(DT, CUTOFF))
     assert late.lag_s - wait * DT == pytest.approx(
         np.sqrt(2) * 3**0.25 / (2 * np.pi * CUTOFF), rel=0.005
     )
@@ -62,7 +62,7 @@ def test_ramp_has_the_stated_lag_or_is_predicted(delay: float, wait: int) -> Non
 
 def test_prediction_increases_noise_by_the_stated_factor() -> None:
     noise = np.random.default_rng(5).normal(size=(200_000, 1))
-    lag = filter_lag(DT, CUTOFF)
+    lag = low_pass_delay_s(DT, CUTOFF)
     plain, ahead = (causal_low_pass(noise, DT, CUTOFF, a).std() for a in (0.0, lag))
     assert ahead / plain == pytest.approx(np.sqrt(3), rel=0.04)
 

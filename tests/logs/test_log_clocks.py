@@ -86,7 +86,7 @@ def test_repeated_rows_are_removed() -> None:
     ("stamps", "time", "words"),
     [
         ([0, 0.1, 0.2, 0.15, 0.3], {}, "1 time stamps decrease, the first in row 5 of log.csv, by"),
-        ([0.1] * 9, {}, "the time stamps of log.csv never increase; name another column"),
+        ([0.1] * 9, {}, "the time stamps of log.csv never increase; set time.column"),
         ([NAN] * 9, {}, "no finite number in 9 rows"),
         (np.arange(9.0), {}, "a rate of 1 Hz; probably `unit: ms`"),
         (np.arange(9.0) * 1e3, {}, "probably `unit: us`"),

@@ -277,7 +277,7 @@ def test_lag_of_a_drifting_clock_is_given_at_the_first_row() -> None:
         mid_record_lag_s=0.3, clock_drift=2e-3, mid_record_time_s=50.0, lag_s=0.31
     )
     data = SimpleNamespace(
-        start_lag_and_clock_drift_correction=lambda *given: (given[2], "both", given)
+        correction_of_lag_and_clock_drift=lambda *given: (given[2], "both", given)
     )
     description = SimpleNamespace(imu="an IMU")
     finding, (stream, _, _, drift) = _correct_imu_clock(description, drifting, data)

@@ -148,7 +148,7 @@ def test_mounting_is_estimated_within_its_deviations(
     assert (
         found.is_determined
         and found.lever_arm is not None
-        and found.lever_arm.is_determined_by_axis.all()
+        and found.lever_arm.are_axes_determined.all()
     )
     # Interpolation of the pose causes errors of 0.1 % of lever arm and rotation.
     error = np.abs(rotation_vector_deg(found.R_SI @ R_SI.T))
@@ -194,7 +194,7 @@ def test_wrench_determines_the_lever_arm_without_a_pose(seed: int) -> None:
     description = described(pose=False, frame=recorder.R_SI.tolist())
     tables = recorder.tables()
     found = lever_arm_from_wrench(read_described_log(description, "log.yaml", tables=tables))
-    assert found is not None and found.is_determined_by_axis.all()
+    assert found is not None and found.are_axes_determined.all()
     assert (np.abs(found.p_SoIo_S - p) < 4 * found.deviations + 3e-4).all()
     auto = read_described_log(
         described(pose=False, frame=recorder.R_SI.tolist(), position="auto"),
@@ -257,8 +257,8 @@ def test_rotation_about_one_axis_determines_two_coordinates(source: str) -> None
     at_Io = read_described_log(described(**streams), "log.yaml", tables=recorder.tables())
     lever = mounting(recorder).lever_arm if source == "pose" else lever_arm_from_wrench(at_Io)
     assert lever is not None and lever.source == source
-    assert lever.is_determined_by_axis.tolist() == [True, False, True]
-    known = lever.is_determined_by_axis
+    assert lever.are_axes_determined.tolist() == [True, False, True]
+    known = lever.are_axes_determined
     error = (lever.p_SoIo_S - recorder.p_SoIo_S)[known]
     assert (np.abs(error) < 4 * lever.deviations[known] + 3e-4).all()
     with pytest.raises(DrakeTeleopError, match=r"imu.position: .*determine y of"):

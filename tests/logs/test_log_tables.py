@@ -293,7 +293,9 @@ def test_damaged_mat_file_raises_error(
         packed = zlib.compress(bytes(body))
         body = bytearray(struct.pack("<II", 15, len(packed)) + packed)
     path.write_bytes(head + bytes(body))
-    with pytest.raises(DrakeTeleopError, match=r"it is damaged or incomplete|it has no arrays"):
+    with pytest.raises(
+        DrakeTeleopError, match=r"it is damaged or incomplete|the file has no arrays"
+    ):
         read_table(path)
 
 

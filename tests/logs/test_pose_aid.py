@@ -23,7 +23,7 @@ from drake_teleop.logs.pose_motion.spectra import (
     Spectra,
     WrenchGrid,
     end_taper,
-    noise_moments,
+    pose_noise_moments,
 )
 from drake_teleop.logs.pose_motion.splines import (
     SPLINE_DEGREE,
@@ -125,7 +125,7 @@ def test_noise_of_splines_of_poses_and_imu_is_predicted():
         error = splines.signals(t, GRAVITY_W) - clean
         power = bands.sums_over_bands(np.abs(window.signal_spectrum(error)) ** 2)
         spectra = Spectra(window, window.signal_spectrum(clean), 0.0, clean)
-        Q = noise_moments(splines, spectra, splines.estimate_pose_noise())
+        Q = pose_noise_moments(splines, spectra, splines.estimate_pose_noise())
         fast = bands.sums_over_bands(bands.frequency) / bands.half_dof_of_bands > 2.0
         for k, where in enumerate((slice(1, 4), slice(7, 10))):
             sums[k] += power[fast, where].sum()

@@ -59,13 +59,13 @@ from drake_teleop.logs.pose_motion.rigid import (
     motion_transformation_matrix,
 )
 from drake_teleop.logs.pose_motion.spectra import (
-    SIGNAL_RATE_COLUMNS,
+    SIGNAL_RATE_SLICE,
     FitWindow,
     NoiseLevels,
     Spectra,
     WrenchGrid,
     end_taper,
-    noise_moments,
+    pose_noise_moments,
     second_moments,
 )
 from drake_teleop.logs.pose_motion.spectra import exclude_from_taper as exclude_from_taper
@@ -201,7 +201,7 @@ def test_noise_moments_predict_the_effect_of_noise():
     spectra = window.spectra_at_delay(splines, 0.0)
     zeta = spectra.motion_signals
     place, turn = 2e-4, 5e-4
-    Q = noise_moments(splines, spectra, (place, turn))
+    Q = pose_noise_moments(splines, spectra, (place, turn))
     sums = np.zeros_like(Q)
     none, rates = np.zeros((len(bands.frequency), 6)), 2j * np.pi * bands.frequency[:, None]
     for seed in range(12):
@@ -215,7 +215,7 @@ def test_noise_moments_predict_the_effect_of_noise():
         spectrum = window.signal_spectrum(error)
         sums += second_moments(bands, spectrum, none, rates * spectrum) / 12
     # Below 2 Hz the motion modulates additional noise from higher frequencies.
-    whole = NoiseLevels.white_within_groups(bands).sums_over_groups
+    whole = NoiseLevels.white_noise_in_each_group(bands).sums_over_groups
     well = whole(bands.sums_over_bands(bands.frequency)) / whole(bands.half_dof_of_bands) > 2.0
     sums, Q = whole(sums), whole(Q)
     size = np.sqrt(np.einsum("bii,bjj->bij", Q, Q))
@@ -224,7 +224,7 @@ def test_noise_moments_predict_the_effect_of_noise():
     both = sums[well], Q[well]
     diagonal, expected = (np.diagonal(x, axis1=1, axis2=2).sum(axis=0) for x in both)
     shown = expected > 0.0
-    assert shown[1:16].all() and shown[SIGNAL_RATE_COLUMNS][1:].all()
+    assert shown[1:16].all() and shown[SIGNAL_RATE_SLICE][1:].all()
     np.testing.assert_allclose(diagonal[shown], expected[shown], rtol=0.15)
 
 
@@ -311,14 +311,14 @@ def test_noise_of_poses_does_not_bias_the_load():
     )
     taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
     spectra = FitWindow(grid, taper, GRAVITY_W, 12.0).spectra_at_delay(splines, LATE)
-    Q = noise_moments(splines, spectra, splines.estimate_pose_noise())
+    Q = pose_noise_moments(splines, spectra, splines.estimate_pose_noise())
     free, start = np.arange(23) < 17, RigidParameters(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
     inertias = []
     for noise in (Q, np.zeros_like(Q)):
         record_ = _RigidFitData(
             spectra.second_moments_with_rates(),
             noise,
-            NoiseLevels.white_within_groups(spectra.window.bands),
+            NoiseLevels.white_noise_in_each_group(spectra.window.bands),
             free,
             fit_coefficients(spectra).noise_power,
         )
@@ -400,12 +400,12 @@ def test_weights_recover_from_a_poor_start():
     )
     taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
     spectra = FitWindow(grid, taper, GRAVITY_W, 20.0).spectra_at_delay(splines, LATE)
-    Q = noise_moments(splines, spectra, splines.estimate_pose_noise())
+    Q = pose_noise_moments(splines, spectra, splines.estimate_pose_noise())
     start = RigidParameters(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
     fit = fit_rigid(
         spectra.second_moments_with_rates(),
         Q,
-        NoiseLevels.white_within_groups(spectra.window.bands),
+        NoiseLevels.white_noise_in_each_group(spectra.window.bands),
         start,
         np.arange(23) < 17,
         fit_coefficients(spectra),
@@ -494,7 +494,7 @@ def test_gain_effects_predict_the_change_of_the_estimate():
     spectra = FitWindow(grid, taper, GRAVITY_W, 20.0).spectra_at_delay(splines, LATE)
     Z, levels, free = (
         spectra.second_moments_with_rates(),
-        NoiseLevels.white_within_groups(spectra.window.bands),
+        NoiseLevels.white_noise_in_each_group(spectra.window.bands),
         np.ones(23, bool),
     )
     none, start = np.zeros_like(Z), RigidParameters(np.zeros(16), 0.0, np.zeros(3), np.eye(3))

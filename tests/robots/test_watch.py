@@ -13,7 +13,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.causal import filter_lag
+from drake_teleop.logs.causal import low_pass_delay_s
 from drake_teleop.logs.read.alignment import low_pass
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.compensate import run_compensate_command
@@ -162,7 +162,7 @@ def test_command_gives_delay_and_prediction_to_the_detector(
     cutoff_hz, used_delay, ahead_s = given
     delay_readings = max(0, round(delay / DT)) if delay != "auto" else 0
     assert (cutoff_hz, used_delay) == (30.0, delay)
-    expected = delay_readings * DT + filter_lag(DT, 30.0) if predicted else 0.0
+    expected = delay_readings * DT + low_pass_delay_s(DT, 30.0) if predicted else 0.0
     assert ahead_s == pytest.approx(expected)
 
 

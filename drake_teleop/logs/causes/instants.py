@@ -1,6 +1,6 @@
 """Wrench and motion as block means at about 50 Hz, and sums of their products.
 
-All models of this package are linear in the signals of one instant,
+All models of this package are linear in 67 signals of one instant,
 
     y = [1, s, g, alpha, products of omega, F, dF/dt, R, R p, time],
 
@@ -25,7 +25,7 @@ ALPHA_SIGNALS, OMEGA_PRODUCTS = slice(7, 10), slice(10, 16)
 WRENCH_SIGNALS, WRENCH_RATE_SIGNALS = slice(16, 22), slice(22, 28)
 ROTATION_SIGNALS, ROTATION_POSITION_PRODUCTS = slice(28, 37), slice(37, 64)
 TIME_POLYNOMIALS, NUM_SIGNALS = slice(64, 67), 67
-COLUMNS_REPEATED_BY_STEP = np.r_[0:16, 28:37]
+STEP_CHANGE_SIGNAL_INDICES = np.r_[0:16, 28:37]
 """Columns of the load's wrench; a step at t1 repeats them, multiplied by u(t - t1)."""
 _INSTANT_RATE_HZ, _MAX_INSTANTS = 50.0, 20_000
 _BLOCK_LENGTH_S, _MAX_BLOCKS, _MIN_BLOCK_ROWS = 0.25, 320, 5
@@ -37,7 +37,7 @@ _MAX_TRIED_DELAY_S, _DELAY_STEP_S = 0.25, 0.01
 _CONSTANT_AND_MOTION_COLUMNS = slice(0, 16)
 _OMEGA_PRODUCT_AXIS_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
-MotionAtTime = Callable[[Array], tuple[Array, ...]]
+MotionByTime = Callable[[Array], tuple[Array, ...]]
 """Function of times (K,): s, omega, alpha (K, 3); if known R_WS (K, 3, 3) and p (K, 3)."""
 
 
@@ -47,14 +47,14 @@ class BlockMeans:
 
     Attributes:
         t: (M,) middle of each block [s].
-        y: (M, 67) signals of the module docstring; 0 in unused rows.
+        y: (M, 67) wrench and motion signals, see the module; 0 in unused rows.
         used: (M,) True for rows without gaps and edges.
         wrench_noise: (6,) standard deviation of white wrench noise in a block mean.
         gravity_W: (3,) gravity in the world [m/s^2], or None.
         acceleration_noise: standard deviation of acceleration noise in a block mean [m/s^2]; inf if
             the acceleration is unknown and taken as zero.
         alpha_noise_share: share of noise in the variance of an IMU's angular acceleration.
-        clock_rate: extension of `LoadModel` for a wrong rate of the clock, or None.
+        clock_rate: name of the model term for a wrong clock rate, or None.
     """
 
     t: Array
@@ -82,27 +82,25 @@ class BlockMeans:
 
     @cached_property
     def rows_per_search_block(self) -> int:
-        """Number of rows per block in the search for contacts and changes."""
         least = -(-len(self.t) // _MAX_BLOCKS)
         return max(least, _MIN_BLOCK_ROWS, round(_BLOCK_LENGTH_S / self.dt))
 
-    def with_other_rows_zeroed(self, used: NDArray[np.bool_]) -> BlockMeans:
+    def with_only_used_rows(self, used: NDArray[np.bool_]) -> BlockMeans:
         return replace(self, y=np.where(used[:, None], self.y, 0.0), used=used)
 
     def append_step_signals(self, times: tuple[float, ...]) -> Array:
         """Return y (M, 67) with 25 columns appended for each step time [s].
 
-        These are the columns of the load's wrench and offsets, multiplied by 0 before and 1 after
-        the step.
+        These are the 25 signals of the load's wrench, times 0 before and 1 after the step.
         """
         parts = [self.y]
         for time in times:
             share = np.clip((self.t - time) / self.dt + 0.5, 0.0, 1.0)
-            parts.append(self.y[:, COLUMNS_REPEATED_BY_STEP] * share[:, None])
+            parts.append(self.y[:, STEP_CHANGE_SIGNAL_INDICES] * share[:, None])
         return np.hstack(parts)
 
     def lagged_block_sums(self, y: Array, *, rows: int, lags: int = AR_ORDER + 1) -> Array:
-        """Return block sums (blocks, lags, W, W) of y_i y_(i-d)^T, plus transpose if lag d > 0."""
+        """Return block sums (blocks, lags, W, W) of products y_i y_(i-d)^T; symmetric."""
         width = y.shape[1]
         count = -(-len(y) // rows)
         padded = np.zeros((lags - 1 + count * rows, width))
@@ -120,7 +118,7 @@ class BlockMeans:
 def block_means_of_record(
     t: Array,
     wrench: Array,
-    motion: MotionAtTime | tuple[Array, ...],
+    motion: MotionByTime | tuple[Array, ...],
     gravity_W: Array | None,
     lost: NDArray[np.bool_] | None = None,
     acceleration_noise: float = 0.0,
@@ -128,7 +126,7 @@ def block_means_of_record(
     """Return block means of a record with N samples at equally spaced times `t` [s].
 
     The wrench (N, 6) is [f; tau] on the load, in S about So, Eq. (1). `gravity_W` is in the world
-    [m/s^2], None without orientation. Blocks with a `lost` sample are not used.
+    [m/s^2], None without orientation. Blocks with a missing (`lost`) sample are not used.
     """
     dt = float(t[-1] - t[0]) / (len(t) - 1)
     size = max(1, round(1.0 / (_INSTANT_RATE_HZ * dt)), -(-len(t) // _MAX_INSTANTS))
@@ -155,7 +153,7 @@ def block_means_of_record(
     share = _smooth_noisy_alpha_and_get_noise_share(y, used) if gravity_W is None else 0.0
     noise = white / np.sqrt(size)
     out = BlockMeans(middle, y, used, noise, gravity_W, positions, acceleration_noise, share)
-    return out.with_other_rows_zeroed(used)
+    return out.with_only_used_rows(used)
 
 
 def _smooth_noisy_alpha_and_get_noise_share(y: Array, used: NDArray[np.bool_]) -> float:
@@ -176,7 +174,7 @@ def _min_noise_share_of_channels(x: Array) -> float:
 
 
 def _write_motion_and_get_has_positions(
-    y: Array, t: Array, size: int, motion: MotionAtTime | tuple[Array, ...], gravity_W: Array | None
+    y: Array, t: Array, size: int, motion: MotionByTime | tuple[Array, ...], gravity_W: Array | None
 ) -> bool:
     rows, total = len(y), np.zeros(())
     if not callable(motion) or size <= _MAX_EXACTLY_AVERAGED_SAMPLES:
@@ -206,20 +204,20 @@ def _motion_signal_columns(motion: Sequence[Array], gravity_W: Array | None) -> 
     return np.hstack(parts)
 
 
-def delay_of_linear_fit(data: BlockMeans) -> float:
+def delay_of_linear_fit(means: BlockMeans) -> float:
     """Return the motion delay behind the wrench [s] with the best linear fit.
 
-    The fit combines 16 motion signals freely, without a rigid load. The delay is within 0.25 s and
-    a tenth of the record; return 0 if it is at an end of this range.
+    The fit combines 16 motion signals freely, without a rigid load. The delay is limited to
+    0.25 s or a tenth of the record, the smaller; return 0 at an end of this range.
     """
-    reach = min(_MAX_TRIED_DELAY_S, 0.1 * float(data.t[-1] - data.t[0]))
-    rows = data.used & (data.t > data.t[0] + reach) & (data.t < data.t[-1] - reach)
-    spline = CubicSpline(data.t, data.y[:, _CONSTANT_AND_MOTION_COLUMNS])
-    forces = data.y[rows][:, WRENCH_SIGNALS]
+    reach = min(_MAX_TRIED_DELAY_S, 0.1 * float(means.t[-1] - means.t[0]))
+    rows = means.used & (means.t > means.t[0] + reach) & (means.t < means.t[-1] - reach)
+    spline = CubicSpline(means.t, means.y[:, _CONSTANT_AND_MOTION_COLUMNS])
+    forces = means.y[rows][:, WRENCH_SIGNALS]
     total = (forces * forces).sum(axis=0)
 
     def sum_ln_squared_residuals(shift_s: float) -> float:
-        x = spline(data.t[rows] + shift_s)
+        x = spline(means.t[rows] + shift_s)
         size = np.sqrt((x * x).mean(axis=0))
         x = x[:, size > 1e-9 * size.max()]
         x /= np.sqrt((x * x).mean(axis=0))

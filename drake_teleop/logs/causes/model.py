@@ -14,29 +14,29 @@ from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.normal_equations import centripetal_matrix, regressor_coefficients
 from drake_teleop.logs.causes import instants
 from drake_teleop.logs.causes.instants import (
-    COLUMNS_REPEATED_BY_STEP,
     ROTATION_POSITION_PRODUCTS,
     ROTATION_SIGNALS,
+    STEP_CHANGE_SIGNAL_INDICES,
     TIME_POLYNOMIALS,
 )
 
 OFFSETS_AND_LOAD, DELAY_INDEX = slice(0, 16), 16  # positions in the parameter vector
-_NUM_PARAMETERS_OF_EXTENSION = {
+_PARAMETER_COUNT_BY_EXTENSION = {
     "gravity": 3, "weight": 4, "torque factor": 1, "frame": 3, "rotation": 3,
     "linear drift": 6, "drift": 18, "cable": 12,
     "clock rate of poses": 1, "clock rate of orientations": 1, "clock rate of gyroscope": 1,
 }  # fmt: skip
-CLOCK_RATE_POWER = {
+CLOCK_RATE_EXPONENTS = {
     "clock rate of poses": 2, "clock rate of orientations": 2, "clock rate of gyroscope": 1,
 }  # fmt: skip
 """Power p: for time steps r times the true ones, accelerations have the factor 1 + x = r**p."""
-_MAX_CHANGE_PER_ITERATION = {"frame": 0.3, "rotation": 0.6, "torque factor": 0.3, "gain": 0.5}
+_MAX_CHANGE_BY_PARAMETER = {"frame": 0.3, "rotation": 0.6, "torque factor": 0.3, "gain": 0.5}
 """Largest change of a parameter in an iteration [m, rad, 1]."""
-_ROTATION_COLUMNS_OF_STEP_CHANGE = slice(16, 25)
+_ROTATION_SLICE_IN_STEP_COLUMNS = slice(16, 25)
 _MAX_DELAY_CHANGE_PER_ITERATION_S = 0.03
 _FINITE_DIFFERENCE_ROTATION_RAD = 1e-4  # of the numerical derivative
 # (6, 10, 12) V of s, alpha and the products of omega.
-_REGRESSOR_TENSOR = regressor_coefficients()[:, 6:, 7:19]
+_LOAD_REGRESSOR = regressor_coefficients()[:, 6:, 7:19]
 SYMMETRIC_MATRIX_INDICES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 """Index (3, 3) in [xx, xy, xz, yy, yz, zz] of each entry of a symmetric matrix."""
 
@@ -75,7 +75,7 @@ class LoadModel:
     def parameter_slices(self) -> dict[str, slice]:
         """Slices of the parameter vector for each extension, "gain c" (channel c) and "step i"."""
         out, at = {}, DELAY_INDEX + 1
-        sizes = [(name, _NUM_PARAMETERS_OF_EXTENSION[name]) for name in self.extensions]
+        sizes = [(name, _PARAMETER_COUNT_BY_EXTENSION[name]) for name in self.extensions]
         sizes += [(f"gain {c}", 1) for c in self.gain_channels]
         steps = enumerate(self.steps)
         sizes += [(f"step {i}", 6 if step.kind == "offsets" else 10) for i, step in steps]
@@ -90,12 +90,12 @@ class LoadModel:
 
     @cached_property
     def columns(self) -> NDArray[np.intp]:
-        """Indices (k,) of the used signals among the columns of `append_step_signals`."""
+        """Indices (k,) of the used columns: 67 signals, then 25 for each step."""
         kept = np.ones(_step_change_columns(len(self.steps)).start, bool)
         if not {"gravity", "cable"} & set(self.extensions):
             kept[ROTATION_SIGNALS], kept[ROTATION_POSITION_PRODUCTS] = False, False
             for i in range(len(self.steps)):
-                kept[_step_change_columns(i)][_ROTATION_COLUMNS_OF_STEP_CHANGE] = False
+                kept[_step_change_columns(i)][_ROTATION_SLICE_IN_STEP_COLUMNS] = False
         return np.flatnonzero(kept)
 
     @cached_property
@@ -105,7 +105,7 @@ class LoadModel:
         out[DELAY_INDEX] = _MAX_DELAY_CHANGE_PER_ITERATION_S
         for name, where in self.parameter_slices.items():
             kind = "gain" if name.startswith("gain") else name
-            out[where] = _MAX_CHANGE_PER_ITERATION.get(kind, np.inf)
+            out[where] = _MAX_CHANGE_BY_PARAMETER.get(kind, np.inf)
         return out
 
     @property
@@ -113,7 +113,7 @@ class LoadModel:
         return tuple(step.time for step in self.steps)
 
     def start_parameters(self, x: Array, other_model: LoadModel) -> Array:
-        """Return parameters (size,): values x of `other_model` where it has them, else 0."""
+        """Return parameters (size,): from x of `other_model` for shared terms, else 0."""
         out = np.zeros(self.size)
         out[: DELAY_INDEX + 1] = x[: DELAY_INDEX + 1]
         for name, where in self.parameter_slices.items():
@@ -122,16 +122,16 @@ class LoadModel:
         return out
 
     def wrench_coefficients(self, x: Array) -> Array:
-        """Return C (B, 6, W) for B parameters x (B, size): C times W signals is the wrench."""
+        """Return C (B, 6, W) for B parameter vectors (B, size): C times W signals is the wrench."""
         parts, motion = self.parameter_slices, self._motion_from_signals_matrix(x)
         out = np.zeros((len(x), 6, _step_change_columns(len(self.steps)).start))
         out[..., : instants.NUM_SIGNALS] = _wrench_coefficients_of_load(x[:, 6:16]) @ motion
         for i, step in enumerate(self.steps):
             if step.kind == "load":
                 load = _wrench_coefficients_of_load(x[:, parts[f"step {i}"]])
-                out[..., _step_change_columns(i)] = load @ motion[..., COLUMNS_REPEATED_BY_STEP]
+                out[..., _step_change_columns(i)] = load @ motion[..., STEP_CHANGE_SIGNAL_INDICES]
         if "weight" in parts:
-            removed = np.einsum("bj,cjk->bck", x[:, parts["weight"]], _REGRESSOR_TENSOR[:, :4, :3])
+            removed = np.einsum("bj,cjk->bck", x[:, parts["weight"]], _LOAD_REGRESSOR[:, :4, :3])
             out[..., instants.GRAVITY_SIGNALS] += removed  # - V(-g) w
         if "cable" in parts:
             out[..., : instants.NUM_SIGNALS] += _wrench_coefficients_of_cable(x[:, parts["cable"]])
@@ -159,7 +159,7 @@ class LoadModel:
 
     def _motion_from_signals_matrix(self, x: Array) -> Array:
         parts = self.parameter_slices
-        varied = {"gravity", "frame", *CLOCK_RATE_POWER} & parts.keys()
+        varied = {"gravity", "frame", *CLOCK_RATE_EXPONENTS} & parts.keys()
         M = np.zeros((len(x) if varied else 1, 12, instants.NUM_SIGNALS))
         M[:, 0:3, instants.SPECIFIC_FORCE_SIGNALS] = M[:, 3:6, instants.ALPHA_SIGNALS] = np.eye(3)
         M[:, 6:12, instants.OMEGA_PRODUCTS] = np.eye(6)
@@ -171,7 +171,7 @@ class LoadModel:
             r = x[:, parts["frame"]]
             M[:, :3, instants.ALPHA_SIGNALS] -= cross_matrix(r)
             M[:, :3, instants.OMEGA_PRODUCTS] += centripetal_matrix(r)
-        for name in CLOCK_RATE_POWER.keys() & parts.keys():
+        for name in CLOCK_RATE_EXPONENTS.keys() & parts.keys():
             factor = 1.0 + x[:, parts[name].start, None, None]
             M[:, :, instants.ALPHA_SIGNALS] *= factor
             if name != "clock rate of gyroscope":
@@ -181,8 +181,8 @@ class LoadModel:
                 M[:, 0:3, instants.GRAVITY_SIGNALS] += (factor - 1.0) * np.eye(3)
         return M
 
-    def wrench_derivative(self, x: Array) -> Array:
-        """Return derivatives (size, 6, k) of `wrench_coefficients` of used signals by x (size,)."""
+    def wrench_jacobian(self, x: Array) -> Array:
+        """Return derivatives (size, 6, k) of the wrench's coefficients of k used signals by x."""
         steps = np.ones(self.size)
         if "rotation" in self.parameter_slices:
             steps[self.parameter_slices["rotation"]] = _FINITE_DIFFERENCE_ROTATION_RAD
@@ -199,12 +199,12 @@ class LoadModel:
 
 
 def _step_change_columns(i: int) -> slice:
-    start = instants.NUM_SIGNALS + len(COLUMNS_REPEATED_BY_STEP) * i
-    return slice(start, start + len(COLUMNS_REPEATED_BY_STEP))
+    start = instants.NUM_SIGNALS + len(STEP_CHANGE_SIGNAL_INDICES) * i
+    return slice(start, start + len(STEP_CHANGE_SIGNAL_INDICES))
 
 
 def _wrench_coefficients_of_load(phi: Array) -> Array:
-    return np.einsum("bj,cjk->bck", phi, _REGRESSOR_TENSOR)
+    return np.einsum("bj,cjk->bck", phi, _LOAD_REGRESSOR)
 
 
 def _wrench_coefficients_of_cable(x: Array) -> Array:

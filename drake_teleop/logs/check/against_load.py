@@ -1,4 +1,4 @@
-"""Corrections of signs, axes, units and clocks in log descriptions so that a load fits, Eq. (5)."""
+"""Search for signs, axes, units and clocks of a log description with which a rigid load fits."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ from drake_teleop.logs.read.alignment import (
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
 
-MAX_GOOD_UNEXPLAINED = 0.02
+MAX_GOOD_RESIDUAL_SHARE = 0.02
 """Largest unexplained share of the variance, without white noise, of a good fit."""
-MAX_VALID_UNEXPLAINED = 0.05
+MAX_VALID_RESIDUAL_SHARE = 0.05
 """Largest unexplained share of the variance, without white noise, of a valid description."""
-MIN_MISFIT_REDUCTION_BY_EDIT = 4.0  # least factor on the unexplained share
+MIN_MISFIT_REDUCTION_FACTOR = 4.0  # least factor on the unexplained share
 _FALSE_ALARM_RATE, _NUM_TESTED_EDITS = 1e-6, 50
-_FINDINGS_NOT_COMBINED_WITH_SIGN = ("sign", "swapped axes")
+_FINDINGS_WITHOUT_WRENCH_SIGN_EDIT = ("sign", "swapped axes")
 """Sign, and axes: with the opposite sign they are mirrored, a cause that `identify` reports."""
 _KEPT_SHARE_WITHOUT_CONTACT = 0.75  # of a record with contact
 _LOAD_FIT_CUTOFF_HZ, _MAX_FITTED_SAMPLES = 15.0, 1500
@@ -60,17 +60,17 @@ class LoadFitQuality:
 
     @property
     def is_good(self) -> bool:
-        limit = self.max_unexplained_including_noise(MAX_GOOD_UNEXPLAINED)
+        limit = self.max_residual_share_including_noise(MAX_GOOD_RESIDUAL_SHARE)
         return self.mass > 0 and self.unexplained < limit
 
-    def max_unexplained_including_noise(self, limit_without_noise: float) -> float:
-        """Return the limit of `unexplained`: `limit_without_noise` plus noise, at most 0.9."""
-        return min(limit_without_noise + self.noise_share, MIN_UNEXPLAINED_OF_UNKNOWN_LOAD)
+    def max_residual_share_including_noise(self, limit_without_noise: float) -> float:
+        """Return the limit of the unexplained share: `limit_without_noise` + noise, at most 0.9."""
+        return min(limit_without_noise + self.noise_share, MIN_RESIDUAL_SHARE_OF_UNKNOWN_LOAD)
 
 
 def fit_load(log: Log, kept_share: float = 1.0) -> LoadFitQuality:
     """Fit a load to the best `kept_share` of samples of a low-passed log; return the quality."""
-    return _fit_load_to_samples(_low_pass_and_thin_log(log), kept_share)
+    return _fit_load_to_samples(_low_pass_and_decimate_log(log), kept_share)
 
 
 class _LowPassedSamples(NamedTuple):
@@ -83,7 +83,7 @@ class _LowPassedSamples(NamedTuple):
     wrench_noise: Array
 
 
-def _low_pass_and_thin_log(log: Log) -> _LowPassedSamples:
+def _low_pass_and_decimate_log(log: Log) -> _LowPassedSamples:
     limit = max_cutoff_by_pose_noise(log)
     cutoff = None if log.static else min(_LOAD_FIT_CUTOFF_HZ, 0.2 / log.dt, limit)
     smooth = low_pass_log(log, cutoff).select_rows(is_far_from_gaps(log, cutoff))
@@ -148,18 +148,18 @@ def _wrench_channel_scales(wrench: Array) -> Array:
     return np.repeat([force + least, max(torque, 0.03 * force) + least], 3)
 
 
-MIN_UNEXPLAINED_OF_UNKNOWN_LOAD = 0.9  # share of the variance
+MIN_RESIDUAL_SHARE_OF_UNKNOWN_LOAD = 0.9  # share of the variance
 MIN_REPORTED_LAG_S = 0.002
 _NUM_DELAY_PARTS, _MIN_DELAY_PARTS = 8, 4
 _MIN_DELAY_DRIFT_S, _MAX_DELAY_DEVIATION_OVER_DRIFT = 0.03, 0.15
 """Smallest change of the delay [s]; largest deviation from a line, as a share of it."""
-_MAX_UNEXPLAINED_RATIO_AFTER_CORRECTION = 0.5
+_MAX_RESIDUAL_RATIO_AFTER_CORRECTION = 0.5
 
 
 def check_wrench_and_estimate_delay(
     description: Description, data: LogTables
 ) -> tuple[list[Finding], float | None]:
-    """Return findings on wrench, orientation, clocks; and delay of motion behind wrench [s]."""
+    """Return findings on wrench, orientation, clocks; delay of motion behind wrench [s] or None."""
     log = data.read_whole_log(description)
     delay = None if log.static else estimate_delay(log, 30.0)
     thin = data.read_thinned_log(description)
@@ -177,7 +177,7 @@ def check_wrench_and_estimate_delay(
             if edited is not description and why is not None:
                 raise DrakeTeleopError(why)
             aligned = [remove_delay(log, shift) for shift in {0.0, delay or 0.0}]
-            samples_of_edits[id(edited)] = [_low_pass_and_thin_log(each) for each in aligned]
+            samples_of_edits[id(edited)] = [_low_pass_and_decimate_log(each) for each in aligned]
         fits = [_fit_load_to_samples(each, kept_share) for each in samples_of_edits[id(edited)]]
         return min(fits, key=lambda fit: fit.unexplained)
 
@@ -224,15 +224,15 @@ def _select_far_better_edits(
             continue
         if fit.mass > 0:
             positive.append((fit, finding, edited))
-        elif finding is not None and finding.name not in _FINDINGS_NOT_COMBINED_WITH_SIGN:
+        elif finding is not None and finding.name not in _FINDINGS_WITHOUT_WRENCH_SIGN_EDIT:
             negative.append((fit, *edits.edit_with_opposite_wrench_sign(finding, edited)))
         elif finding is None:  # a clock and the sign
             negative.append((fit, *next(edits.wrench_and_motion_edits(edited))))
     # A negative mass is impossible: an equally good fit with a positive one suffices.
-    valid = given.max_unexplained_including_noise(MAX_VALID_UNEXPLAINED)
+    valid = given.max_residual_share_including_noise(MAX_VALID_RESIDUAL_SHARE)
     n = max(1.0, given.independent_samples)
     least_factor = float(fdtri(n, n, 1 - _FALSE_ALARM_RATE / _NUM_TESTED_EDITS))
-    decisive = given.unexplained / max(MIN_MISFIT_REDUCTION_BY_EDIT, least_factor)
+    decisive = given.unexplained / max(MIN_MISFIT_REDUCTION_FACTOR, least_factor)
     limit = min(1.01 * given.unexplained if given.mass < 0 else decisive, valid)
     found = [entry for entry in positive if entry[0].unexplained < limit]
     return found or [entry for entry in negative if entry[0].unexplained < min(decisive, valid)]
@@ -280,7 +280,7 @@ def _payload_or_lag_findings_and_delay(
     kept = ~fit.rejected
     wrench, (s, omega, alpha) = smooth.wrench[kept], (x[kept] for x in smooth.motion)
     residual = contact_wrench(wrench, load.offsets, s, omega, alpha, load.phi)
-    limit = MAX_VALID_UNEXPLAINED + given.noise_share
+    limit = MAX_VALID_RESIDUAL_SHARE + given.noise_share
     if delay is None or unexplained_share(wrench, residual) > limit:
         return [], None
     if fit.rejected.any():
@@ -291,8 +291,8 @@ def _payload_or_lag_findings_and_delay(
 
 
 def undetermined_payload_finding(load: Identification, unexplained: float) -> Finding | None:
-    """Return a finding if the record does not determine the mass of the load, else None."""
-    if load.verdicts[6] != "not" and unexplained < MIN_UNEXPLAINED_OF_UNKNOWN_LOAD:
+    """Return a finding if the mass of the load is undetermined; `unexplained` share of variance."""
+    if load.verdicts[6] != "not" and unexplained < MIN_RESIDUAL_SHARE_OF_UNKNOWN_LOAD:
         return None
     deviation = float(load.standard_deviations[6])
     fitted = "no signal of the record depends on its mass"
@@ -350,8 +350,8 @@ def clock_drift_finding_and_correction(
     if line is None:
         return [], description
     late, slope = line
-    _, lines, edited = data.start_lag_and_clock_drift_correction(name, description, late, slope)
-    limit = _MAX_UNEXPLAINED_RATIO_AFTER_CORRECTION * _unexplained_share_after_delay_removal(log)
+    _, lines, edited = data.correction_of_lag_and_clock_drift(name, description, late, slope)
+    limit = _MAX_RESIDUAL_RATIO_AFTER_CORRECTION * _unexplained_share_after_delay_removal(log)
     if _unexplained_share_after_delay_removal(data.read_thinned_log(edited)) > limit:
         return [], description
     text = f"the clock of the {name} drifts by {1e3 * slope:.3g} ms per second against the wrench's"

@@ -17,7 +17,7 @@ from drake_teleop.common.numeric import Array, one_blas_thread, white_noise_devi
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check import against_load, edits
-from drake_teleop.logs.check.against_load import MAX_GOOD_UNEXPLAINED, LoadFitQuality
+from drake_teleop.logs.check.against_load import MAX_GOOD_RESIDUAL_SHARE, LoadFitQuality
 from drake_teleop.logs.check.edits import LogTables
 from drake_teleop.logs.check.motion_checks import (
     check_imu_against_pose,
@@ -33,13 +33,13 @@ from drake_teleop.logs.read.table_files import TABLE_READERS
 from drake_teleop.logs.read.tables import Table
 
 _MIN_STATIC_POSES_FOR_CHECK = 6
-_MIN_GRAVITY_DIRECTION_STD = 0.15  # that separates offsets from a load
+_MIN_GRAVITY_DIRECTION_STD_RAD = 0.15  # that separates offsets from a load
 _MIN_WRENCH_RANGE_OVER_MAGNITUDE = 1e-6  # of a live wrench, over the largest reading
 
 
 @dataclass(frozen=True)
 class ConventionCheckResult:
-    """Findings on a description, load fit, IMU mounting, delay of motion behind the wrench [s]."""
+    """Findings on a log description, with fit, IMU mounting, motion delay behind the wrench [s]."""
 
     findings: tuple[Finding, ...]
     fit: LoadFitQuality
@@ -63,7 +63,7 @@ def findings_if_load_is_suspicious(
 ) -> tuple[Finding, ...]:
     """Return findings, except "lag", if mass, fit, delay [s], gravity or a signal is implausible.
 
-    `predicted` (N, 6) is the wrench of offsets and load; `check` returns the findings. Raise
+    `predicted` (N, 6) is the wrench of offsets and load; `check` runs the checks. Raise
     DrakeTeleopError if the load is useless and a remedy is known.
     """
     if _is_wrench_constant(log):
@@ -73,7 +73,7 @@ def findings_if_load_is_suspicious(
     unexplained = against_load.unexplained_share(log.wrench, log.wrench - predicted)
     weight = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
     clocks = log.static or (delay is not None and abs(delay) < edits.MIN_LAG_OF_WRONG_CLOCK_S)
-    if load.mass > 0 and unexplained < MAX_GOOD_UNEXPLAINED and clocks and 5.0 < weight < 20.0:
+    if load.mass > 0 and unexplained < MAX_GOOD_RESIDUAL_SHARE and clocks and 5.0 < weight < 20.0:
         # A good fit may hide errors of the IMU, but `check` takes longer than the fit.
         return tuple(_findings_except_lag(check)) if _has_dead_channel_or_imu_finding(log) else ()
     found = _findings_except_lag(check)
@@ -101,7 +101,7 @@ def findings_if_load_is_suspicious(
 
 
 def motion_findings(check: Callable[[], ConventionCheckResult]) -> tuple[Finding, ...]:
-    """Return the findings of `check` that concern the described motion, not the wrench."""
+    """Run the checks and return the findings on the described motion, not on the wrench."""
     return tuple(x for x in _findings_except_lag(check) if x.name in edits.MOTION_FINDINGS)
 
 
@@ -200,7 +200,7 @@ def _static_pose_findings(log: Log) -> list[Finding]:
     size = np.linalg.norm(log.specific_force, axis=1, keepdims=True)
     up = log.specific_force / np.maximum(size, 1e-9)
     least = float(np.linalg.svd(up - up.mean(axis=0), compute_uv=False)[-1]) / np.sqrt(len(up))
-    if least >= _MIN_GRAVITY_DIRECTION_STD:
+    if least >= _MIN_GRAVITY_DIRECTION_STD_RAD:
         return []
     text = (
         "the poses are too alike: along one direction gravity in S varies by only"
@@ -210,8 +210,8 @@ def _static_pose_findings(log: Log) -> list[Finding]:
     return [Finding("static poses", text)]
 
 
-_WRENCH_FIELDS = ("force", "torque")
-_IMU_FIELDS = ("specific_force", "angular_velocity", "angular_acceleration")
+_WRENCH_QUANTITIES = ("force", "torque")
+_IMU_QUANTITIES = ("specific_force", "angular_velocity", "angular_acceleration")
 _MIN_LIVE_CHANNEL_NOISE_OVER_RANGE = 1e-6
 
 
@@ -224,7 +224,7 @@ def _dead_or_repeated_channel_findings(
     if described is None:
         return found
     table = tables[described.source].rows_with_any_number(described.columns)
-    for field in _WRENCH_FIELDS if stream == "wrench" else _IMU_FIELDS:
+    for field in _WRENCH_QUANTITIES if stream == "wrench" else _IMU_QUANTITIES:
         quantity = getattr(described, field, None)
         if quantity is None:
             continue

@@ -1,4 +1,4 @@
-"""Draft of a log description from names and magnitudes of columns (long: many spellings)."""
+"""Draft of a log description from names and magnitudes of columns."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ _NUMBERED_COLUMN_PATTERNS: dict[str, dict[str, tuple[int, ...]]] = {
 }
 _HOMOGENEOUS_MATRIX_INDICES = {"matrix": (0, 1, 2, 4, 5, 6, 8, 9, 10), "position": (3, 7, 11)}
 _MATRIX_ELEMENT_NAMES = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
-_BASE_FORCE_PATTERN = r"tcp_force(_?\d+)?$|^o_f_ext"
+_BASE_FORCE_REGEX = r"tcp_force(_?\d+)?$|^o_f_ext"
 _ROBOT_COLUMN_NOTES = {
     r"tcp_force$": "The TCP's force excludes the payload set in the controller: set it to 0.",
     r"f_ext": "An external wrench is an estimate that excludes the load that is set in the robot.",
@@ -76,7 +76,7 @@ _POSE_VECTOR_PATTERN = r"(state|pose|tcp|eef?|cartesian)(_[a-z]+)*_\d+$"
 _QUATERNION_LENGTH_TOLERANCE = 0.01  # of the length
 _NUMBERED_QUATERNION_PATTERN = r"(^|_)(q|quat|quaternion|orient|orientation|rot)_?u?[0-4]$"
 _MAX_ROWS_OF_STATIC_LOG = 200  # a table without time and with more rows has a constant rate
-_MIN_MEDIAN_OF_RAW_COUNTS = 2000.0  # median of integers that are raw counts
+_MIN_MEDIAN_OF_RAW_SENSOR_COUNTS = 2000.0  # median of integers that are raw counts
 _MAX_GYRO_RATE_DEG_S = 4000.0  # faster than any gyroscope measures
 _FILL_IN_TEXT, _MIN_CLOCK_ROWS = "FILL IN", 20
 _COUNTER_COLUMN_PATTERN = r"(^|_)(index|idx|frame|row|seq|counter|count|sample|episode)s?(_|$)"
@@ -94,7 +94,7 @@ _NO_TIME_NOTE = "No column of time was recognized; without one, set time: {rate:
 
 
 class Draft(NamedTuple):
-    """Draft of a log description: its streams as in YAML, comment lines, and findings."""
+    """Draft of a log description: streams as in YAML, comments and findings on these."""
 
     streams: dict[str, Any]
     comment_lines: list[str]
@@ -134,12 +134,12 @@ def _is_unfilled(stream: dict[str, Any]) -> bool:
     return bool(columns) and set(columns) == {_FILL_IN_TEXT}
 
 
-_NamesAndUnits = dict[str, tuple[str, str]]  # by column: its normalized name, and its unit
-_Columns = dict[str, list[str]]  # names of the columns of each recognized vector
+_ColumnLabels = dict[str, tuple[str, str]]  # by column: its normalized name, and its unit
+_ColumnsByVector = dict[str, list[str]]  # names of the columns of each recognized vector
 
 
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> Draft:
-    """Return a log description guessed from names and magnitudes of columns."""
+    """Return a log description guessed from a table, with paths relative to `folder`."""
     labels = {name: _normalized_name_and_unit(name) for name in table.columns}
     found = _find_euler_angles(labels) | _find_pose_vectors(table, labels) | _find_vectors(labels)
     found |= _find_numbered_or_array_vectors(table, labels) | _find_quaternion(table, labels)
@@ -156,7 +156,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     both = {kind: _draft_quantity(table, labels, kind, columns) for kind, columns in pair.items()}
     wrench = stream_with_time(**both, sign=1)
     forces = [_remove_trailing_number(labels[name][0]) for name in found.get("force", [])[:1]]
-    if any(re.search(_BASE_FORCE_PATTERN, name) for name in forces):
+    if any(re.search(_BASE_FORCE_REGEX, name) for name in forces):
         wrench["frame"] = "base"
     draft: dict[str, Any] = {}
     if "force" in found or "torque" in found:
@@ -199,15 +199,15 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     return Draft(draft, head, tuple(_findings_on_other_wrenches(table, labels, found)))
 
 
-def _find_numbered_or_array_vectors(table: Table, labels: _NamesAndUnits) -> _Columns:
+def _find_numbered_or_array_vectors(table: Table, labels: _ColumnLabels) -> _ColumnsByVector:
     numbered = _find_vectors_in_numbered_columns(labels)
     return numbered | _find_vectors_in_array_columns(table, labels)
 
 
 def _findings_on_other_wrenches(
-    table: Table, labels: _NamesAndUnits, found: _Columns
+    table: Table, labels: _ColumnLabels, found: _ColumnsByVector
 ) -> Iterator[Finding]:
-    """Yield a finding for each wrench in the table besides that in `found`."""
+    """Yield a finding for each wrench in the table besides the drafted one, `found`."""
     pair = "force", "torque"
     used = {x for names in found.values() for x in names}
     taken = ", ".join(x for kind in pair for x in found.get(kind, ()))
@@ -220,9 +220,9 @@ def _findings_on_other_wrenches(
             return
         used = {x for kind in pair for x in other[kind]}
         lines = " and ".join(f"wrench.{kind}.columns: {other[kind]}" for kind in pair)
-        frame = "base" if re.search(_BASE_FORCE_PATTERN, labels[other["force"][0]][0]) else "sensor"
+        frame = "base" if re.search(_BASE_FORCE_REGEX, labels[other["force"][0]][0]) else "sensor"
         text = f"the wrench is read from {taken}; another wrench is in {', '.join(sorted(used))}"
-        yield Finding("other wrench", f"{text}; to use it, set {lines} and wrench.frame: {frame}")
+        yield Finding("other wrench", f"{text}; to change, set {lines} and wrench.frame: {frame}")
 
 
 def _normalized_name_and_unit(name: str) -> tuple[str, str]:
@@ -238,11 +238,11 @@ def _remove_trailing_number(name: str) -> str:
     return re.sub(r"_?\d+$", "", name)
 
 
-def _is_command_or_estimate(name: str) -> bool:
+def _is_commanded_or_estimated_value(name: str) -> bool:
     return bool(re.search(r"(^|_)(target|tcp_force|ext|est|estimated|cmd|desired)(_|$)", name))
 
 
-def _group_numbered_columns(labels: _NamesAndUnits, pattern: str) -> dict[str, list[str]]:
+def _group_numbered_columns(labels: _ColumnLabels, pattern: str) -> dict[str, list[str]]:
     groups: dict[str, list[str]] = {}
     for name, (words, _) in labels.items():
         if re.search(pattern, words):
@@ -250,27 +250,27 @@ def _group_numbered_columns(labels: _NamesAndUnits, pattern: str) -> dict[str, l
     return groups
 
 
-def _find_vectors(labels: _NamesAndUnits) -> _Columns:
+def _find_vectors(labels: _ColumnLabels) -> _ColumnsByVector:
     groups = {kind: _group_by_vector(labels, kind, x) for kind, x in _VECTOR_NAME_PATTERNS.items()}
-    found: _Columns = {}
+    found: _ColumnsByVector = {}
     for pair in _VECTOR_PAIRS_WITH_SHARED_PREFIX:
         shared = [name for name in groups[pair[0]] if name in groups[pair[1]]]
-        shared.sort(key=_is_command_or_estimate)
+        shared.sort(key=_is_commanded_or_estimated_value)
         for kind in pair:
             for name in (shared or list(groups[kind]))[:1]:
                 found[kind] = groups[kind][name]
     return found
 
 
-def _group_by_vector(labels: _NamesAndUnits, kind: str, names: str) -> _Columns:
-    """Return the columns of each vector of a `kind` by prefix; complete ones if there are any."""
-    axes = "wxyz" if kind == "orientation" else "xyz"
+def _group_by_vector(labels: _ColumnLabels, quantity: str, names: str) -> _ColumnsByVector:
+    """Group x, y, z columns of a quantity `quantity` by name prefix; prefer complete groups."""
+    axes = "wxyz" if quantity == "orientation" else "xyz"
     ends = rf"^(.*?)(?:(?:^|_)(?:{names}))_?([{axes}])$"
     groups: dict[str, dict[str, str]] = {}
     for name, (words, _) in labels.items():
         if match := re.match(ends, words):
             groups.setdefault(match[1], {}).setdefault(match[2], name)
-        elif kind == "position" and words in ("x", "y", "z"):
+        elif quantity == "position" and words in ("x", "y", "z"):
             groups.setdefault("", {}).setdefault(words, name)
     spelled = "|".join(x for x in names.split("|") if len(x) > 2)
     threes = {} if groups else _group_numbered_columns(labels, rf"(^|_)({spelled})_?[0-3]$")
@@ -278,13 +278,13 @@ def _group_by_vector(labels: _NamesAndUnits, kind: str, names: str) -> _Columns:
         return found
     for name, (words, unit) in labels.items() if not groups else ():  # in another language
         match = re.match(r"^(.*?)_?([xyz])$", words)
-        if match and known_unit(unit) in _ALLOWED_UNITS.get(kind, ()):
+        if match and known_unit(unit) in _ALLOWED_UNITS.get(quantity, ()):
             groups.setdefault(match[1], {}).setdefault(match[2], name)
     whole = {name: group for name, group in groups.items() if len(group) == len(axes)}
     return {name: [x[a] for a in axes if a in x] for name, x in (whole or groups).items()}
 
 
-def _find_euler_angles(labels: _NamesAndUnits) -> _Columns:
+def _find_euler_angles(labels: _ColumnLabels) -> _ColumnsByVector:
     ends: dict[str, dict[str, str]] = {}
     for name, (words, _) in labels.items():
         prefix, _, end = re.sub("theta_(?=[xyz]$)", "r", words).rpartition("_")  # of Kinova
@@ -297,7 +297,7 @@ def _find_euler_angles(labels: _NamesAndUnits) -> _Columns:
     return {}
 
 
-def _find_pose_vectors(table: Table, labels: _NamesAndUnits) -> _Columns:
+def _find_pose_vectors(table: Table, labels: _ColumnLabels) -> _ColumnsByVector:
     groups = _group_numbered_columns(labels, _POSE_VECTOR_PATTERN)
     for columns in (group for group in groups.values() if len(group) in (7, 8)):
         for first, kind in ((3, "quaternion_xyzw"), (0, "orientation")):
@@ -313,20 +313,20 @@ def _are_unit_quaternions(table: Table, quaternion: list[str]) -> bool:
     return bool(np.nanmax(np.abs(length - 1.0)) < _QUATERNION_LENGTH_TOLERANCE)
 
 
-def _find_quaternion(table: Table, labels: _NamesAndUnits) -> _Columns:
+def _find_quaternion(table: Table, labels: _ColumnLabels) -> _ColumnsByVector:
     groups = _group_numbered_columns(labels, _NUMBERED_QUATERNION_PATTERN)
     fours = [group for group in groups.values() if len(group) == 4]
     found = next((group for group in fours if _are_unit_quaternions(table, group)), None)
     return {"orientation": found} if found else {}
 
 
-def _find_vectors_in_numbered_columns(labels: _NamesAndUnits) -> _Columns:
+def _find_vectors_in_numbered_columns(labels: _ColumnLabels) -> _ColumnsByVector:
     groups = _group_numbered_columns(labels, r"\d$")
-    found: _Columns = {}
+    found: _ColumnsByVector = {}
     for start, kinds in _NUMBERED_COLUMN_PATTERNS.items():
         most = max(k for places in kinds.values() for k in places)
         fit = [base for base in groups if re.search(start, base) and len(groups[base]) > most]
-        for base in sorted(fit, key=_is_command_or_estimate)[:1]:
+        for base in sorted(fit, key=_is_commanded_or_estimated_value)[:1]:
             for kind, places in kinds.items():
                 found[kind] = [groups[base][k] for k in places]
     by_words = {words: name for name, (words, _) in labels.items()}
@@ -335,8 +335,8 @@ def _find_vectors_in_numbered_columns(labels: _NamesAndUnits) -> _Columns:
     return found
 
 
-def _find_vectors_in_array_columns(table: Table, labels: _NamesAndUnits) -> _Columns:
-    found: _Columns = {}
+def _find_vectors_in_array_columns(table: Table, labels: _ColumnLabels) -> _ColumnsByVector:
+    found: _ColumnsByVector = {}
     arrays = _names_of_array_columns(table)
     for kind, names in {**_VECTOR_NAME_PATTERNS, "matrix": "r|rot|rotation(_matrix)?"}.items():
         width = {"orientation": 4, "matrix": 9}.get(kind, 3)
@@ -363,36 +363,36 @@ def _count_scalars_per_row(table: Table, columns: list[str]) -> int:
 
 
 def _draft_quantity(
-    table: Table, labels: _NamesAndUnits, kind: str, columns: list[str]
+    table: Table, labels: _ColumnLabels, quantity: str, columns: list[str]
 ) -> dict[str, Any]:
     group: dict[str, Any] = {"columns": list(columns)}
     if _FILL_IN_TEXT in columns:
         return group
-    if kind in ("force", "torque"):
+    if quantity in ("force", "torque"):
         x = table.numbers_with_nan(columns[0], columns[0])
         is_integer = (np.nan_to_num(x) % 1.0 == 0.0).all()
-        if is_integer and np.nanmedian(np.abs(x)) > _MIN_MEDIAN_OF_RAW_COUNTS:
+        if is_integer and np.nanmedian(np.abs(x)) > _MIN_MEDIAN_OF_RAW_SENSOR_COUNTS:
             group["scale"] = _FILL_IN_TEXT
     if spelling := labels[columns[0]][1]:
         unit = known_unit(spelling)
-        group["unit"] = unit if unit in _ALLOWED_UNITS[kind] else _FILL_IN_TEXT
+        group["unit"] = unit if unit in _ALLOWED_UNITS[quantity] else _FILL_IN_TEXT
         return group
-    if kind in ("force", "torque"):
+    if quantity in ("force", "torque"):
         return group
     size = np.linalg.norm(table.numbers_with_nan_side_by_side(columns, columns[0]), axis=1)
-    if kind == "specific_force":
+    if quantity == "specific_force":
         median = np.nanmedian(size)
         limits = {"g": (0, 3), "m/s^2": (3, 30), "mg": (700, 1400), "mm/s^2": (7e3, 14e3)}
         fitting = [unit for unit, (low, high) in limits.items() if low <= median < high]
         return group | ({"unit": fitting[0]} if fitting else {"scale": _FILL_IN_TEXT})
-    if kind == "angular_velocity" and np.nanmax(size) > _MAX_GYRO_RATE_DEG_S:
+    if quantity == "angular_velocity" and np.nanmax(size) > _MAX_GYRO_RATE_DEG_S:
         return group | {"unit": "mdeg/s"}
     units = {"angular_velocity": ("rad/s", "deg/s", 15), "position": ("m", "mm", 20)}
-    usual, other, limit = units.get(kind, ("rad", "deg", 15))
+    usual, other, limit = units.get(quantity, ("rad", "deg", 15))
     return group | {"unit": other if np.nanmax(size) > limit else usual}
 
 
-def _draft_pose(table: Table, labels: _NamesAndUnits, found: _Columns) -> dict[str, Any]:
+def _draft_pose(table: Table, labels: _ColumnLabels, found: _ColumnsByVector) -> dict[str, Any]:
     if _count_scalars_per_row(table, found.get("orientation", [])) == 4:
         orientation = {"columns": found["orientation"], "form": "quaternion_wxyz"}
     elif form := next((name for name in ("quaternion_xyzw", "matrix") if name in found), None):
@@ -410,7 +410,7 @@ def _draft_pose(table: Table, labels: _NamesAndUnits, found: _Columns) -> dict[s
     return pose
 
 
-def _draft_time(table: Table, labels: _NamesAndUnits, vector_column: str) -> dict[str, Any]:
+def _draft_time(table: Table, labels: _ColumnLabels, vector_column: str) -> dict[str, Any]:
     named = [name for name, (words, _) in labels.items() if re.search(_TIME_NAME_PATTERN, words)]
     named += [name for name, (_, unit) in labels.items() if unit.lower() in _ALLOWED_UNITS["time"]]
     named = [name for name in named if f"{name}[0]" not in table.columns]
@@ -435,7 +435,7 @@ def _draft_time(table: Table, labels: _NamesAndUnits, vector_column: str) -> dic
     return {"column": named[0], "unit": unit}
 
 
-def _find_clock_columns(table: Table, labels: _NamesAndUnits) -> list[str]:
+def _find_clock_columns(table: Table, labels: _ColumnLabels) -> list[str]:
     def is_clock(name: str) -> bool:
         values = np.asarray(table.columns[name])
         if values.ndim != 1 or values.dtype.kind not in "fiu" or len(values) < _MIN_CLOCK_ROWS:

@@ -84,7 +84,7 @@ def correct_accelerometer_unit(
 
 
 def orientation_and_gravity_sign_edits(description: Description) -> Iterator[Edit]:
-    """Yield edits of a description: other forms of the orientation, opposite sign of gravity."""
+    """Yield edits of a description: inverse or reordered orientation, opposite sign of gravity."""
     pose, imu, edit = description.pose, description.imu, partial(make_edit, description)
     sensed = imu is not None and imu.specific_force is not None
     if imu is not None and sensed:
@@ -165,7 +165,7 @@ def wrench_and_motion_edits(description: Description) -> Iterator[Edit]:
     old = np.array(sensor.frame) if isinstance(sensor.frame, tuple) else np.eye(3)
     for R in right_angled_rotations()[1:] if sensor.frame != "base" else ():
         frame = {f"{stream}.frame": (R @ old).tolist()}
-        yield edit("swapped axes", "the axes of the wrench are rotated", frame)
+        yield edit("swapped axes", "the wrench is rotated relative to the motion", frame)
 
 
 _THINNED_RATE_HZ = 100.0
@@ -173,7 +173,7 @@ _THINNED_TIME_COLUMN_PREFIX = "thinned time stamps of"
 
 
 class LogTables:
-    """Tables of a log in memory, complete and thinned to about 100 Hz."""
+    """Tables of a log in memory: the complete ones, and copies thinned to about 100 Hz."""
 
     def __init__(self, description: Description, source: str, tables: dict[Path, Table]) -> None:
         self._description, self._source, self.tables = description, source, tables
@@ -193,7 +193,6 @@ class LogTables:
         return read_described_log(description, self._source, tables=self.tables)
 
     def read_thinned_log(self, description: Description) -> Log:
-        """Return the thinned log (about 100 Hz), read as `description` defines it."""
         stamped = {}
         for name, stream in description.streams.items():
             if (time := getattr(stream, "time", None)) is not None:
@@ -205,10 +204,10 @@ class LogTables:
         description = description.model_copy(update=stamped)
         return read_described_log(description, self._source, tables=self._thinned)
 
-    def start_lag_and_clock_drift_correction(
+    def correction_of_lag_and_clock_drift(
         self, name: str, description: Description, lag_at_wrench_start_s: float, drift: float
     ) -> tuple[float, str, Description]:
-        """Return a stream's lag at its first row [s], lines that correct it, edited description.
+        """Return a stream's lag at its first row [s], YAML text of the fix, corrected description.
 
         The clock of stream `name` lags by `lag_at_wrench_start_s` at the wrench's first row. The
         lag grows by `drift` [s/s].

@@ -7,7 +7,7 @@ import numpy as np
 from drake_teleop.common.rotations import signed_permutations
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.causes.cause import Finding
-from drake_teleop.logs.check.against_load import MAX_VALID_UNEXPLAINED
+from drake_teleop.logs.check.against_load import MAX_VALID_RESIDUAL_SHARE
 from drake_teleop.logs.pose_motion.splines import PoseSplines
 from drake_teleop.logs.read.canonical import Log
 
@@ -24,8 +24,8 @@ def left_handed_pose_finding(
 ) -> Finding | None:
     """Return a finding if only a mirrored motion explains the wrench, else None.
 
-    A mirrored motion explains [P f; -P tau], where P is a signed permutation with determinant -1.
-    All axes and signs of force, torque and gravity are tried. `splines` are late by `delay_s` [s].
+    A mirrored motion explains [P f; -P tau] with a signed permutation P of determinant -1. All
+    axes and signs of force, torque and gravity are tried. `splines` lag the wrench by `delay_s`.
     """
     few = log.select_rows(slice(None, None, 1 + len(log) // _MAX_COMPARED_SAMPLES))
     wrench = (few.wrench - few.wrench.mean(axis=0)).reshape(-1, 2, 3)
@@ -50,5 +50,5 @@ def left_handed_pose_finding(
         for mirrored in least:
             valid = (is_mirrored == mirrored) & (phi[0] > 0.0)
             least[mirrored] = min(least[mirrored], unexplained[valid].min(initial=np.inf))
-    limit = min(MAX_VALID_UNEXPLAINED, _MAX_MISFIT_RATIO_OF_MIRRORED_POSES * least[False])
+    limit = min(MAX_VALID_RESIDUAL_SHARE, _MAX_MISFIT_RATIO_OF_MIRRORED_POSES * least[False])
     return Finding("left-handed", _LEFT_HANDED_POSES_MESSAGE) if least[True] < limit else None

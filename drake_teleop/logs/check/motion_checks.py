@@ -12,9 +12,9 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import axis_names_of_rows, rotation_matrices, signed_permutations
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.check.against_load import (
-    MAX_GOOD_UNEXPLAINED,
-    MAX_VALID_UNEXPLAINED,
-    MIN_MISFIT_REDUCTION_BY_EDIT,
+    MAX_GOOD_RESIDUAL_SHARE,
+    MAX_VALID_RESIDUAL_SHARE,
+    MIN_MISFIT_REDUCTION_FACTOR,
 )
 from drake_teleop.logs.check.edits import (
     MIN_LAG_OF_WRONG_CLOCK_S,
@@ -39,7 +39,7 @@ from drake_teleop.logs.read.mounting import (
     rotation_angle_deg,
 )
 
-SPEED_RATIO_RANGE_OF_DEGREES = (40.0, 80.0)
+GYRO_TO_POSE_SPEED_RANGE_OF_DEG_S = (40.0, 80.0)
 """Range of a speed ratio of 180 / pi, degrees over radians, with noise and gain errors."""
 MIN_REPORTED_RELATIVE_GRAVITY_ERROR = 0.02  # calibrated sensors are within 1 %
 _MIN_GRAVITY_ERROR_OVER_DEVIATION, _ALPHA_COMPARISON_CUTOFF_HZ = 5.0, 5.0
@@ -71,7 +71,7 @@ def _angle_unit_edit(description: Description, imu: Imu, log: Log) -> Edit | Non
     correlation = float(np.sum(given_alpha * derived_alpha))
     if min(sizes) == 0.0 or correlation < _MIN_ALPHA_CORRELATION * sizes[0] * sizes[1]:
         return None
-    ratio, (least, most) = sizes[0] / sizes[1], SPEED_RATIO_RANGE_OF_DEGREES
+    ratio, (least, most) = sizes[0] / sizes[1], GYRO_TO_POSE_SPEED_RANGE_OF_DEG_S
     for wrong, quantity, unit, other in (
         (ratio, "angular_acceleration", "rad/s^2", "deg/s^2"),
         (1.0 / ratio, "angular_acceleration", "deg/s^2", "rad/s^2"),
@@ -136,7 +136,7 @@ def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
 
 
 def _mean_specific_forces_in_start_axes(log: Log, gyro_axes: Array) -> Array:
-    """Return mean specific forces (2, n, 3) in n Hann windows, and in windows half a length later.
+    """Return mean specific forces (2, n, 3) in n Hann windows, then in windows half a length later.
 
     Integrated angular velocity, its axes permuted by `gyro_axes`, rotates them to the axes at the
     start of the window.
@@ -209,25 +209,25 @@ def check_imu_against_pose(
         return [], None, description
     findings: list[Finding] = []
     is_rotated = given.rotation_angle_deg > 10
-    if given.unexplained > MAX_GOOD_UNEXPLAINED or given.is_mirrored or is_rotated:
+    if given.unexplained > MAX_GOOD_RESIDUAL_SHARE or given.is_mirrored or is_rotated:
         better = [
             (found, finding, edited)
             for finding, edited in orientation_and_gravity_sign_edits(description)
             if (found := call_or_none_if_unreadable(fit_mounting, edited)) and not found.is_mirrored
         ]
-        limit = min(MAX_VALID_UNEXPLAINED, given.unexplained / MIN_MISFIT_REDUCTION_BY_EDIT)
+        limit = min(MAX_VALID_RESIDUAL_SHARE, given.unexplained / MIN_MISFIT_REDUCTION_FACTOR)
         if given.is_mirrored:
             better = [entry for entry in better if entry[0].rotation_angle_deg < 10]
-        elif is_rotated and given.unexplained < MAX_VALID_UNEXPLAINED:
+        elif is_rotated and given.unexplained < MAX_VALID_RESIDUAL_SHARE:
             # In a rotation about one axis an inverted orientation resembles a rotated IMU. An edit
             # that keeps the described mounting is the simpler explanation.
             better = [entry for entry in better if entry[0].rotation_angle_deg < 10]
-            limit = min(MAX_VALID_UNEXPLAINED, 1.5 * given.unexplained + 1e-4)
+            limit = min(MAX_VALID_RESIDUAL_SHARE, 1.5 * given.unexplained + 1e-4)
         best = min(better, key=lambda entry: entry[0].unexplained, default=None)
         if best and best[0].unexplained < limit:
             given, finding, description = best
             findings.append(finding)
-    if given.unexplained > MAX_VALID_UNEXPLAINED and not given.is_mirrored:
+    if given.unexplained > MAX_VALID_RESIDUAL_SHARE and not given.is_mirrored:
         return findings, given, description
     if abs(given.lag_s) > MIN_LAG_OF_WRONG_CLOCK_S or given.clock_drift:
         finding, description = _correct_imu_clock(description, given, data)
@@ -270,7 +270,7 @@ def _correct_imu_clock(description: Description, found: Mounting, data: LogTable
         finding = Finding("clock", f"{text}; set imu.time.offset: {offset:.3f}")
         return finding, edit_field(description, "imu.time.offset", offset)
     late = found.mid_record_lag_s - drift * found.mid_record_time_s
-    lag, lines, edited = data.start_lag_and_clock_drift_correction("imu", description, late, drift)
+    lag, lines, edited = data.correction_of_lag_and_clock_drift("imu", description, late, drift)
     text = f"the clock of the IMU lags that of the pose by {lag:.3f} s at its first row and by"
     text += f" {1e3 * drift:.3g} ms more each second ({found.lag_s:.3f} s is the best constant)"
     return Finding("clock", f"{text}; set {lines}"), edited
@@ -278,7 +278,7 @@ def _correct_imu_clock(description: Description, found: Mounting, data: LogTable
 
 _ACCELERATION_CUTOFF_HZ, _MAX_SHIFT_FIT_CONDITION_NUMBER = 3.0, 1e8
 _MIN_REPORTED_POSE_SHIFT_M, _MAX_POSE_SHIFT_DEVIATION_M = 0.02, 0.01  # m
-_MIN_SCALE_OR_SHIFT_OVER_STD = 5.0  # standard deviations
+_MIN_POSITION_ERROR_OVER_STD = 5.0  # standard deviations
 _UNIT_MATCH_RANGE, _MAX_SCALE_ERROR_FOR_SHIFT = (0.7, 1.43), 0.15
 _MIN_UNIT_ERROR_FACTOR = 50.0
 _MAX_POSITION_SCALE_ERROR_FOR_FRAME, _MIN_COM_TO_SO_M, _MAX_COM_TO_SO_M = 0.1, 2e-4, 1.5  # 1, m, m
@@ -288,13 +288,13 @@ _WRONG_TORQUE_UNIT_RATIOS = (
     *(SI_VALUE_OF_UNIT["lbf"], 1.0 / SI_VALUE_OF_UNIT["lbf"]),
 )
 """Ratios of torque and force in wrong units, which resemble a displaced pose frame."""
-_MAX_COM_ERROR_OVER_COM_DISTANCE = 0.03
+_MAX_MASS_CENTRE_ERROR_OVER_DISTANCE = 0.03
 
 
 def position_unit_or_origin_findings(
     description: Description, data: LogTables, lag: float
 ) -> list[Finding]:
-    """Return a finding if positions have a wrong unit, or are not of the described point.
+    """Return a finding if positions have a wrong unit, or are of another point than described.
 
     The reference is the accelerometer, whose clock lags that of the pose by `lag` [s].
     """
@@ -318,7 +318,7 @@ def position_unit_or_origin_findings(
     inner = slice(len(t) // 50, len(t) - len(t) // 50)
     num_samples = 2.0 * _ACCELERATION_CUTOFF_HZ * float(t[-1] - t[0])
     fit = _centred_fit_and_deviations(columns[inner], by_pose[inner], num_samples)
-    if fit is None or abs(fit[0][0]) <= _MIN_SCALE_OR_SHIFT_OVER_STD * fit[1][0]:
+    if fit is None or abs(fit[0][0]) <= _MIN_POSITION_ERROR_OVER_STD * fit[1][0]:
         return []
     x, deviations = fit
     k = float(x[0])
@@ -329,7 +329,7 @@ def position_unit_or_origin_findings(
     size = float(np.linalg.norm(shift))
     if abs(k - 1.0) > _MAX_SCALE_ERROR_FOR_SHIFT or deviation > _MAX_POSE_SHIFT_DEVIATION_M:
         return []
-    if size < max(_MIN_REPORTED_POSE_SHIFT_M, _MIN_SCALE_OR_SHIFT_OVER_STD * deviation):
+    if size < max(_MIN_REPORTED_POSE_SHIFT_M, _MIN_POSITION_ERROR_OVER_STD * deviation):
         return []
     place, other = shift + np.array(pose.position_in_sensor), np.array(imu.position) - shift
     text = (
@@ -342,18 +342,18 @@ def position_unit_or_origin_findings(
 
 
 def _position_unit_finding(described: str, scale: float, deviation: float) -> Finding | None:
-    if not abs(scale) > _MIN_SCALE_OR_SHIFT_OVER_STD * deviation:
+    if not abs(scale) > _MIN_POSITION_ERROR_OVER_STD * deviation:
         return None
     text = f"the acceleration by the positions is {1.0 / scale:.3g} times the measured one:"
     for unit in POSITION_UNITS:
         ratio = SI_VALUE_OF_UNIT[unit] / SI_VALUE_OF_UNIT[described]
         if unit != described and _UNIT_MATCH_RANGE[0] < scale / ratio < _UNIT_MATCH_RANGE[1]:
-            what = f"they are not in {described}; set pose.position.unit: {unit}"
+            what = f"the positions are not in {described}; set pose.position.unit: {unit}"
             return Finding("units", f"{text} {what}")
     if 1.0 / _MIN_UNIT_ERROR_FACTOR < abs(scale) < _MIN_UNIT_ERROR_FACTOR:  # noise or another error
         return None
     remedy = f"multiply pose.position.scale (1 by default) by {scale:.4g}"
-    return Finding("units", f"{text} their unit is unknown; {remedy}")
+    return Finding("units", f"{text} the unit of the positions is unknown; {remedy}")
 
 
 def _centred_fit_and_deviations(
@@ -376,7 +376,7 @@ def _centred_fit_and_deviations(
 
 
 def pose_unit_or_frame_finding(found: PoseEstimate, log: Log) -> Finding | None:
-    """Return a finding if positions have a wrong unit or the pose frame is not S, else None."""
+    """Return a finding if the estimated position unit is wrong or the pose frame is not S."""
     assert log.posed is not None
     pose = None if log.described is None else log.described.pose
     seen = found.units_and_axes
@@ -389,14 +389,14 @@ def pose_unit_or_frame_finding(found: PoseEstimate, log: Log) -> Finding | None:
 
 
 def pose_frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None:
-    """Return a finding if the pose frame is not S; None if another error is as likely."""
+    """Return a finding if the estimated pose frame is not S; None if other errors are as likely."""
     frame, seen, phi = found.frame, found.units_and_axes, found.free_frame_fit.parameters.theta[6:]
     if not (frame.is_shifted or frame.is_rotated) or phi[0] <= 0.0:
         return None
     limit = max(_MAX_POSITION_SCALE_ERROR_FOR_FRAME, 5.0 * seen.position_unit_ratio_std)
     if abs(seen.position_unit_ratio - 1.0) > limit or (seen.is_usable and seen.is_mirrored):
         return None
-    if _may_torque_unit_explain_shift(phi[1:4] / phi[0], frame.p_SoPo_S):
+    if _may_torque_unit_explain_position_shift(phi[1:4] / phi[0], frame.p_SoPo_S):
         return None
     place = frame.p_SoPo_S + frame.R_SP @ posed.p_SoPo_S
     texts, lines = [], []
@@ -415,8 +415,8 @@ def pose_frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None
     return Finding("pose frame", text)
 
 
-def _may_torque_unit_explain_shift(com: Array, shift: Array) -> bool:
+def _may_torque_unit_explain_position_shift(com: Array, shift: Array) -> bool:
     size = float(np.linalg.norm(com))
     off = min(np.linalg.norm(com - ratio * (com - shift)) for ratio in _WRONG_TORQUE_UNIT_RATIOS)
     is_usual = _MIN_COM_TO_SO_M < size < _MAX_COM_TO_SO_M
-    return not is_usual or bool(off < _MAX_COM_ERROR_OVER_COM_DISTANCE * size)
+    return not is_usual or bool(off < _MAX_MASS_CENTRE_ERROR_OVER_DISTANCE * size)

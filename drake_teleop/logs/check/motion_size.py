@@ -33,7 +33,7 @@ def motion_rms(log: Log) -> tuple[float, float]:
 
 
 def max_cutoff_by_pose_noise(log: Log) -> float:
-    """Return the cut-off [Hz] below which position noise is small in specific force, or inf."""
+    """Return the cut-off [Hz] with little position noise in specific force; inf without poses."""
     by_pose = None if log.posed is None else _motion_rms_of_poses(log.posed)
     if log.posed is None or by_pose is None:
         return np.inf
@@ -58,7 +58,7 @@ def explain_lack_of_motion(log: Log) -> str | None:
 
 @lru_cache(maxsize=1)  # edits of the wrench keep the poses, whose identity is the key
 def _motion_rms_of_poses(posed: PosesOfLog) -> tuple[float, float] | None:
-    """Return `motion_rms` by covariance of even and odd poses, free of noise; None: few poses."""
+    """Return noise-free RMS changes by the covariance of even and odd poses; None for few poses."""
     poses = posed.poses.with_continuous_quaternions()
     count = max(1, int(0.5 * _BLOCK_S * poses.rate))
     rows = len(poses.t) // (2 * count) * 2 * count

@@ -11,7 +11,7 @@ from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.read.canonical import Log
 
 _MAX_COMPARED_SAMPLES, _COMPARED_RATE_HZ = 2000, 50.0
-_DEAD_BAND_OVER_LARGEST_WRENCH, _PLAY_OVER_RANGE = 0.05, 0.01
+_DEAD_BAND_OVER_LARGEST_WRENCH, _BACKLASH_OVER_RANGE = 0.05, 0.01
 _LEAST_EXPLAINED_SHARE, _CERTAIN_EXPLAINED_SHARE, _LEAST_RELATIVE_ERROR = 0.12, 0.3, 0.01
 _MAX_UNEXPLAINED_SHARE = 0.02
 _MESSAGE_OF_NONLINEARITY = {
@@ -25,7 +25,7 @@ _MESSAGE_OF_NONLINEARITY = {
 def error_of_load_by_nonlinear_sensor(
     log: Log, load: Identification
 ) -> tuple[Array, Finding | None]:
-    """Return likely errors (10,) of phi due to a nonlinear sensor, and a finding if they are large.
+    """Return errors (10,) of phi due to a nonlinear sensor, and a finding if they are large.
 
     The errors are 0 if no tested nonlinearity explains the residual. The log is without delay.
     """
@@ -39,7 +39,7 @@ def error_of_load_by_nonlinear_sensor(
     functions = {
         "dead band": [np.tanh(wrench / dead_band)],
         "curvature": [unit**2, unit**3],
-        "hysteresis": [_hysteresis_by_play(unit)],
+        "hysteresis": [_backlash_error(unit)],
     }
     offsets = np.broadcast_to(np.eye(6), (len(V), 6, 6))
     load_columns = np.concatenate([offsets, V], axis=2) / scale[:, None]
@@ -79,10 +79,10 @@ def _fit_columns(wrench: Array, *columns: Array) -> tuple[Array, float]:
     return np.asarray(theta), float(np.sum((b - A @ theta) ** 2))
 
 
-def _hysteresis_by_play(x: Array) -> Array:
-    """Return the error (N, 6) of a reading of x (N, 6) with play, over half the play."""
+def _backlash_error(x: Array) -> Array:
+    """Return the error (N, 6) of a reading of x (N, 6) with backlash, in half backlash widths."""
     out, reading = np.zeros_like(x), x[0]
     for n in range(1, len(x)):
-        reading = np.clip(reading, x[n] - _PLAY_OVER_RANGE, x[n] + _PLAY_OVER_RANGE)
-        out[n] = (reading - x[n]) / _PLAY_OVER_RANGE
+        reading = np.clip(reading, x[n] - _BACKLASH_OVER_RANGE, x[n] + _BACKLASH_OVER_RANGE)
+        out[n] = (reading - x[n]) / _BACKLASH_OVER_RANGE
     return out

@@ -12,11 +12,11 @@ from drake_teleop.logs.read.canonical import Log
 
 _COMPARED_RATE_HZ, _MAX_MISFIT_RATIO_OF_FILTER = 50.0, 0.25
 _SEARCHED_CUTOFFS_HZ = np.geomspace(0.02, 2.0, 25)
-_REFINED_CUTOFF_RATIOS = np.geomspace(0.84, 1.2, 9)
+_RATIOS_TO_BEST_CUTOFF = np.geomspace(0.84, 1.2, 9)
 
 
 def sensor_filter_finding(log: Log, delay_s: float) -> Finding | None:
-    """Return a finding if a high-pass or low-pass on the load's wrench explains the wrench."""
+    """Return a finding if the load's wrench, high- or low-passed, explains the reading."""
     from scipy.signal import butter, lfilter  # slow to import
 
     least, fitting = dict.fromkeys(("none", "high-pass", "low-pass"), np.inf), {"none": 1.0}
@@ -27,7 +27,7 @@ def sensor_filter_finding(log: Log, delay_s: float) -> Finding | None:
         V, wrench = regressor(*few.motion) / scale[:, None], few.wrench / scale
         for is_fine in (False, True):
             best = fitting[min(fitting, key=lambda x: least[x])] if is_fine else 1.0
-            for cutoff in best * (_REFINED_CUTOFF_RATIOS if is_fine else _SEARCHED_CUTOFFS_HZ):
+            for cutoff in best * (_RATIOS_TO_BEST_CUTOFF if is_fine else _SEARCHED_CUTOFFS_HZ):
                 decay = np.exp(-2.0 * np.pi * cutoff * t)  # of the start
                 basis = np.linalg.qr(np.stack([np.ones(len(t)), t, decay, t * decay], axis=1))[0]
                 high = _high_pass(V, cutoff, dt)

@@ -16,9 +16,9 @@ _MAX_COMPARED_SAMPLES, _MAX_MISFIT_RATIO, _MAX_UNEXPLAINED_SHARE = 1000, 0.1, 0.
 
 
 def wrench_channel_finding(log: Log, splines: PoseSplines | None, delay_s: float) -> Finding | None:
-    """Return a finding if a load explains the wrench after one correction only, else None.
+    """Return a finding if a load explains the wrench only after one tested correction, else None.
 
-    The log is without delay; `splines`, the source of its motion, are late by `delay_s` [s].
+    The delay of the log is removed; `splines` of its poses lag the wrench by `delay_s` [s].
     """
     few = log.select_rows(slice(None, None, 1 + len(log) // _MAX_COMPARED_SAMPLES))
     R_WS, names = few.R_WS, [*CHANNEL_NAMES]
@@ -34,13 +34,13 @@ def wrench_channel_finding(log: Log, splines: PoseSplines | None, delay_s: float
     scale = np.linalg.norm(few.wrench.std(axis=0).reshape(2, 3), axis=1).repeat(3) + 1e-12
     V = ((V - V.mean(axis=0)) / scale[:, None]).reshape(-1, 10)
 
-    def unexplained_and_mass(wrench: Array) -> tuple[float, float]:
+    def residual_share_and_mass(wrench: Array) -> tuple[float, float]:
         y = ((wrench - wrench.mean(axis=0)) / scale).ravel()
         phi = np.linalg.lstsq(V, y, rcond=1e-9)[0]
         return float(np.sum((y - V @ phi) ** 2) / (y @ y)), float(phi[0])
 
-    limit = min(_MAX_MISFIT_RATIO * unexplained_and_mass(few.wrench)[0], _MAX_UNEXPLAINED_SHARE)
-    found = {name: unexplained_and_mass(x) for name, x in zip(names, corrected, strict=True)}
+    limit = min(_MAX_MISFIT_RATIO * residual_share_and_mass(few.wrench)[0], _MAX_UNEXPLAINED_SHARE)
+    found = {name: residual_share_and_mass(x) for name, x in zip(names, corrected, strict=True)}
     name = min(found, key=lambda x: found[x])
     if not (found[name][0] < limit and found[name][1] > 0.0):
         return None

@@ -42,16 +42,16 @@ from drake_teleop.logs.read.tables import Table
 from drake_teleop.logs.summaries import summarize_load
 
 # Episodes that determine load, lag and noise: fewer if they are long.
-_MIN_CALIBRATION_EPISODES, _MAX_CALIBRATION_EPISODES = 8, 24
-_MAX_CALIBRATION_ROWS = 12_000
+_MIN_EPISODES_FOR_SHARED_LOAD, _MAX_EPISODES_FOR_SHARED_LOAD = 8, 24
+_MAX_ROWS_FOR_SHARED_LOAD = 12_000
 _MAX_DRAFTED_EPISODES, _MAX_DRAFT_CORRECTIONS = 3, 5
 _STREAM_NAMES = ("wrench", "imu", "pose")
-_MAX_LN_RESIDUAL_WIDTH_OVER_USUAL = 1.5  # of the residual of the best hypothesis
+_MAX_LN_RATIO_TO_USUAL_WIDTH = 1.5  # of the residual of the best hypothesis
 _CONTACT_MARGIN_FRAMES, _MIN_FREE_FRAMES_FOR_OFFSETS = 2, 20
 
 
 class DatasetAndLoad(NamedTuple):
-    """Dataset, its described streams and shared load."""
+    """Dataset with described streams and shared load."""
 
     dataset: Dataset
     streams: dict[str, Any]
@@ -75,7 +75,7 @@ def dataset_command(
     Args:
         load: identification.json of the load.
         identify: identify the load from the episodes instead.
-        description: log description whose `file` is omitted or one of the episodes.
+        description: log description; its `file` is replaced by each episode.
         jobs: number of parallel processes.
     """
     if (load is None) != identify:
@@ -253,8 +253,8 @@ def _estimate_shared_load(
     dataset: Dataset, streams: dict[str, Any], known: Identification | None, progress: Any
 ) -> SharedLoad:
     frames = max(np.median([episode.rows for episode in dataset.episodes]), 1)
-    count = int(_MAX_CALIBRATION_ROWS // frames)
-    count = min(max(count, _MIN_CALIBRATION_EPISODES), _MAX_CALIBRATION_EPISODES)
+    count = int(_MAX_ROWS_FOR_SHARED_LOAD // frames)
+    count = min(max(count, _MIN_EPISODES_FOR_SHARED_LOAD), _MAX_EPISODES_FOR_SHARED_LOAD)
     step = -(-len(dataset.episodes) // count)
     logs, errors = [], []
     for k, episode in enumerate(dataset.episodes[::step]):
@@ -320,9 +320,9 @@ def _verdict_on_episode(
         text = f"the offsets change by [{change}] N, N m at {log.t[k]:.2f} s"
         faults.append(EpisodeFault("tared", text, float(log.t[k])))
     calm = residual - offsets
-    spread, _ = episode_verdict.ln_half_width_and_centre_of_calm_half(calm, 0.1 * usual)
+    spread, _ = episode_verdict.ln_half_width_and_centre(calm, 0.1 * usual)
     spread -= np.log(usual) + np.log(found.gains).repeat(3)
-    if not faults and spread.mean() > _MAX_LN_RESIDUAL_WIDTH_OVER_USUAL:
+    if not faults and spread.mean() > _MAX_LN_RATIO_TO_USUAL_WIDTH:
         text = (
             "no single fault explains the wrench (possible causes: contact most of the time, or a"
             " change of the load)"

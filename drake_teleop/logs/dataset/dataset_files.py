@@ -1,6 +1,6 @@
 """Files of robot-learning datasets: episodes of LeRobot, robomimic, Zarr and folders of tables.
 
-The copy has two more columns; other values are unchanged. Other files are hard links if possible.
+A copied dataset has two more columns in each episode; its other files are hard links if possible.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Dataset(NamedTuple):
 
 @lru_cache(maxsize=1)
 def _read_numeric_columns(file: Path, modified_ns: int) -> Any:
-    """Return the numeric and array columns of a Parquet file, from a cache of the last file."""
+    """Return number and array columns of a Parquet file, cached by its modification time."""
     import polars as pl
 
     frame = pl.scan_parquet(file)
@@ -103,7 +103,7 @@ def open_dataset(path: Path) -> Dataset:
             "give a LeRobot folder, a robomimic .hdf5, a .zarr, or a folder of .csv or"
             " .parquet files, one for each episode"
         )
-        raise DrakeTeleopError("contains no episodes", where=str(path), remedy=remedy)
+        raise DrakeTeleopError("the dataset contains no episodes", where=str(path), remedy=remedy)
     return found
 
 
@@ -145,7 +145,7 @@ def _open_zarr(path: Path) -> Dataset:
 
 
 def write_dataset_copy(dataset: Dataset, out: Path, columns: Sequence[ContactColumns]) -> None:
-    """Write a copy of the dataset with the new columns of each episode to `out`."""
+    """Write a copy with new columns for each episode to `out`."""
     if dataset.kind == "hdf5":
         _write_hdf5_copy(dataset, out, columns)
         return

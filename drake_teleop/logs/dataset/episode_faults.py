@@ -20,7 +20,7 @@ _MIN_WRENCH_ROTATION_DEG, _MIN_UNUSUAL_LAG_FRAMES, _MIN_SATURATED_FRAMES = 4.0, 
 
 
 class EpisodeFault(NamedTuple):
-    """Named fault with its description and figures."""
+    """Fault of an episode: name, text and value."""
 
     name: str
     message: str
@@ -28,27 +28,27 @@ class EpisodeFault(NamedTuple):
 
 
 def list_faults(
-    x: WrenchHypothesis, usual_lag: float, usual_phi: Array, fps: float
+    hypothesis: WrenchHypothesis, usual_lag: float, usual_phi: Array, fps: float
 ) -> list[EpisodeFault]:
-    """Return the faults of an episode that the hypothesis x about its wrench implies.
+    """Return the faults of an episode that a hypothesis about its wrench implies.
 
     `usual_lag` [frames] is that of other episodes, `usual_phi` (10,) the usual load.
     """
-    if x.phi is not None:
-        mass = float(x.phi[0])
+    if hypothesis.phi is not None:
+        mass = float(hypothesis.phi[0])
         text = f"the load is another one: {mass:.3g} kg instead of {usual_phi[0]:.3g} kg"
-        return [EpisodeFault("tool changed", text, x.phi.tolist())]
+        return [EpisodeFault("tool changed", text, hypothesis.phi.tolist())]
     found = []
-    if x.kind == "base":
+    if hypothesis.kind == "base":
         found.append(EpisodeFault("frame", "the wrench is in the axes of the base", "base"))
-    if x.kind == "weight removed":
+    if hypothesis.kind == "weight removed":
         text = "the robot has already removed the load's weight from the wrench"
         found.append(EpisodeFault("weight removed", text, None))
-    same = np.allclose(*x.axes)
-    found += _rotation_faults(x.axes[0], "the wrench" if same else "the force")
-    found += [] if same else _rotation_faults(x.axes[1], "the torque")
-    found += _unit_faults(x.gains)
-    late = x.lag - usual_lag
+    same = np.allclose(*hypothesis.axes)
+    found += _rotation_faults(hypothesis.axes[0], "the wrench" if same else "the force")
+    found += [] if same else _rotation_faults(hypothesis.axes[1], "the torque")
+    found += _unit_faults(hypothesis.gains)
+    late = hypothesis.lag - usual_lag
     if abs(late) >= _MIN_UNUSUAL_LAG_FRAMES:
         side = "behind" if late > 0 else "ahead of"
         text = f"the motion is {abs(late):.1f} frames ({abs(late) / fps:.3f} s) {side} the wrench"

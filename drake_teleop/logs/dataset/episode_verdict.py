@@ -23,7 +23,7 @@ from drake_teleop.logs.pose_motion.splines import MIN_POSES_PER_KNOT, PoseSpline
 from drake_teleop.logs.read.alignment import resample
 from drake_teleop.logs.read.canonical import Log
 
-TRIED_LAGS_PER_FRAME = 8
+NUM_LAGS_PER_FRAME = 8
 """Evenly spaced lags within one frame that are tried."""
 MAX_LAG_FRAMES = 8
 TRIED_WRENCH_CONVENTIONS = ("sensor", "weight removed", "base")
@@ -38,7 +38,7 @@ _SPREAD_COST_PER_FAULT, _SPREAD_COST_TIMES_FRAMES = 0.25, 40.0
 _NUM_START_FIT_PARTS, _MIN_HALF_WIDTH_OVER_USUAL = 4, 0.3
 _MAX_INLIER_DEVIATIONS, _MIN_OFFSET_STEP_DEVIATIONS = 5.0, 5.0
 _MIN_FRAMES_BESIDE_STEP, _MIN_SHARE_BESIDE_STEP, _NUM_TRIED_STEP_FRAMES = 12, 0.12, 20
-_MAX_STD_OVER_DIFFERENCE_NOISE = 1.5  # noise by differences of frames
+_MAX_STD_OVER_SAMPLE_STEP_NOISE = 1.5  # noise by differences of frames
 
 
 @dataclass(frozen=True)
@@ -46,14 +46,14 @@ class WrenchHypothesis:
     """Hypothetical relation of an episode's reading to the wrench of a load.
 
     Attributes:
-        kind: one of `TRIED_WRENCH_CONVENTIONS`.
+        kind: "sensor" (axes), "base" (axes) or "weight removed".
         lag: delay of the motion behind the wrench [frames].
-        axes: rotations or mirrorings (3, 3) of the load's force and torque.
+        axes: two rotations or mirrorings (3, 3), of the load's force and torque.
         gains: (2,) factors of force and torque.
         phi: (10,) of another load; None for the known one.
-        spread: (6,) logarithms of the half widths of the residual.
+        spread: (6,) logarithms of the residual's half widths.
         offsets: (6,) sensor offsets [N, N m].
-        cost: sum of `spread` and of the costs of all faults.
+        cost: sum of `spread`, plus a price for each fault.
     """
 
     kind: str
@@ -76,12 +76,12 @@ class WrenchHypothesis:
         return np.hstack([wrench[:, c] @ M / gain for c, M, gain in parts])
 
 
-def hypothesis_without_fault(lag: float) -> WrenchHypothesis:
+def fault_free_hypothesis(lag: float) -> WrenchHypothesis:
     return WrenchHypothesis("sensor", lag, (np.eye(3), np.eye(3)), np.ones(2))
 
 
-def ln_half_width_and_centre_of_calm_half(residual: Array, floor: Array) -> tuple[Array, Array]:
-    """Return log half widths (6,), at least log `floor`, and centres of a residual's calm half."""
+def ln_half_width_and_centre(residual: Array, floor: Array) -> tuple[Array, Array]:
+    """Return log half widths (6,), at least log `floor`, and centres of its calmer half."""
     widths, centres = width_and_centre_of_narrowest_half(residual)
     return np.log(np.maximum(0.5 * widths, floor)), centres
 
@@ -96,9 +96,9 @@ def find_simplest_hypothesis_and_residual(
     """
     floor = _MIN_HALF_WIDTH_OVER_USUAL * usual_half_widths
     search = HypothesisSearch(signals, phi, usual_lag, floor)
-    usual = search.with_spread_and_cost(hypothesis_without_fault(usual_lag))
+    usual = search.with_spread_and_cost(fault_free_hypothesis(usual_lag))
     if usual.spread.sum() - np.log(usual_half_widths).sum() < search.price:
-        return usual, search.unexplained_reading(usual)
+        return usual, search.reading_without_load(usual)
     found = [usual]
     for kind in TRIED_WRENCH_CONVENTIONS:
         best_lag = search.best_lag(replace(usual, kind=kind))
@@ -109,11 +109,11 @@ def find_simplest_hypothesis_and_residual(
     if best.phi is None:
         found.append(search.with_spread_and_cost(replace(best, lag=search.best_lag(best))))
     best = min(found, key=lambda x: x.cost)
-    return best, search.unexplained_reading(best)
+    return best, search.reading_without_load(best)
 
 
 class HypothesisSearch:
-    """Search for the best hypothesis of an episode; half widths count as at least `floor` (6,)."""
+    """Search for the best hypothesis of an episode; half widths are at least `floor` (6,)."""
 
     def __init__(self, signals: EpisodeSignals, phi: Array, usual_lag: float, floor: Array) -> None:
         self.predict = lru_cache(maxsize=None)(partial(signals.measured_and_load_wrench, phi))
@@ -121,7 +121,7 @@ class HypothesisSearch:
         self.usual_lag, self.floor, self.frames = usual_lag, floor, len(signals.log)
         self.price = _SPREAD_COST_PER_FAULT + _SPREAD_COST_TIMES_FRAMES / self.frames
 
-    def unexplained_reading(self, x: WrenchHypothesis) -> Array:
+    def reading_without_load(self, x: WrenchHypothesis) -> Array:
         """Return the reading (N, 6) minus the load's reading by hypothesis x; offsets remain."""
         wrench, load_wrench = self.predict(x.kind, x.lag)
         if x.phi is not None:
@@ -129,35 +129,35 @@ class HypothesisSearch:
         return wrench - x.reading_of_load(load_wrench)
 
     def with_spread_and_cost(self, x: WrenchHypothesis) -> WrenchHypothesis:
-        residual = self.unexplained_reading(x)
-        spread, offsets = ln_half_width_and_centre_of_calm_half(residual, self.floor)
+        residual = self.reading_without_load(x)
+        spread, offsets = ln_half_width_and_centre(residual, self.floor)
         cost = float(spread.sum()) + self.price * _weighted_number_of_faults(x, self.usual_lag)
         return replace(x, spread=spread, offsets=offsets, cost=cost)
 
     def _best_explained_rows(self, x: WrenchHypothesis) -> NDArray[np.bool_]:
-        residual = (self.unexplained_reading(x) - x.offsets) / np.exp(x.spread)
+        residual = (self.reading_without_load(x) - x.offsets) / np.exp(x.spread)
         return _rows_of_smallest_residual(residual)
 
     def hypotheses_at_lag(self, kind: str, lag: float) -> Iterator[WrenchHypothesis]:
         both, one, eye = self.predict(kind, lag), np.ones(2), np.eye(3)
         force, torque = (self.best_permutation(*both, c) for c in _FORCE_AND_TORQUE_CHANNELS)
-        plain = replace(hypothesis_without_fault(lag), kind=kind)
+        plain = replace(fault_free_hypothesis(lag), kind=kind)
         axes = ((eye, eye), (-eye, -eye), (force, force), (torque, torque), (force, torque))
         yield from (self.with_spread_and_cost(replace(plain, axes=x)) for x in axes)
         for det in (1.0, -1.0):
-            start = self.refit_best_rows(plain, det=det, scale=True)
+            start = self.refit_calm_rows(plain, det=det, scale=True)
             yield start
-            yield self.refit_best_rows(replace(start, gains=one), det=det, scale=False)
+            yield self.refit_calm_rows(replace(start, gains=one), det=det, scale=False)
             nearest = max(_SIGNED_PERMUTATIONS, key=lambda M: float((M * start.axes[0]).sum()))
             for M in (eye, -eye, nearest):
-                yield self.refit_best_rows(replace(start, axes=(M, M)), det=0.0, scale=True)
+                yield self.refit_calm_rows(replace(start, axes=(M, M)), det=0.0, scale=True)
 
     def best_permutation(self, w: Array, p: Array, channels: slice) -> Array:
-        """Return the signed permutation M (3, 3) for which M p fits w best, in three channels."""
+        """Return the signed permutation M (3, 3) for which M p fits w best, in force or torque."""
         w, p, floor = w[:, channels], p[:, channels], self.floor[channels]
         pairs = w[:, :, None, None] - np.multiply.outer(p, [1.0, -1.0])[:, None]
         pairs = pairs.reshape(len(w), -1)
-        spread = ln_half_width_and_centre_of_calm_half(pairs, np.repeat(floor, 6))[0]
+        spread = ln_half_width_and_centre(pairs, np.repeat(floor, 6))[0]
         spread = spread.reshape(3, 3, 2)
         costs = [
             sum(spread[i, j, int(M[i, j] < 0)] for i, j in zip(*np.nonzero(M), strict=True))
@@ -171,11 +171,10 @@ class HypothesisSearch:
         quarters = (at == part for part in range(_NUM_START_FIT_PARTS))
         return min(map(fit, [at >= 0, *quarters]), key=lambda x: x.cost)
 
-    def refit_best_rows(self, x: WrenchHypothesis, *, det: float, scale: bool) -> WrenchHypothesis:
-        """Return x with rotation and factors fitted to the frames with the least residual.
+    def refit_calm_rows(self, x: WrenchHypothesis, *, det: float, scale: bool) -> WrenchHypothesis:
+        """Return hypothesis x with axes and gains fitted to the frames with the least residual.
 
-        `det` is the determinant of the fitted rotation; 0 keeps that of x. `scale` fits the
-        factors.
+        `det` is the determinant of the fitted axes; 0 keeps those of x. `scale` fits the gains.
         """
         both = self.predict(x.kind, x.lag)
 
@@ -202,10 +201,10 @@ class HypothesisSearch:
 
     def hypothesis_of_other_load(self, lag: float) -> WrenchHypothesis:
         wrench, V = self.predict("sensor", lag)[0], self.regress(lag)
-        first_weights = np.exp(-ln_half_width_and_centre_of_calm_half(wrench, self.floor)[0])
+        first_weights = np.exp(-ln_half_width_and_centre(wrench, self.floor)[0])
 
         def fit_from_rows(rows: NDArray[np.bool_]) -> WrenchHypothesis:
-            x, weights = hypothesis_without_fault(lag), first_weights
+            x, weights = fault_free_hypothesis(lag), first_weights
             for _ in range(_NUM_REFITS):
                 w, A = (y[rows] - y[rows].mean(axis=0) for y in (wrench, V))
                 A, w = (A * weights[:, None]).reshape(-1, 10), (w * weights).ravel()
@@ -220,7 +219,7 @@ class HypothesisSearch:
     def best_lag(self, x: WrenchHypothesis) -> float:
         """Return the lag [frames] at which the load of `x` leaves the least residual spread."""
         lag, reach = self.usual_lag, float(MAX_LAG_FRAMES)
-        for step in (0.5, 1.0 / TRIED_LAGS_PER_FRAME):
+        for step in (0.5, 1.0 / NUM_LAGS_PER_FRAME):
             lags = lag + np.arange(-reach, reach + 0.5 * step, step)
             found = (self.with_spread_and_cost(replace(x, lag=float(y))) for y in lags)
             lag, reach = min(found, key=lambda x: x.spread.sum()).lag, 0.5
@@ -285,18 +284,18 @@ def _fault_weight_of_rotation(M: Array) -> float:
 def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array] | None:
     """Return the frame at which the offsets of a residual (N, 6) jump, and both offsets, or None.
 
-    Frames next to the jump already have constant offsets; contact begins gradually.
+    Unlike contact, a jump leaves constant offsets in all frames beside it.
     """
     n = len(residual)
     # Offsets that change in the middle enlarge the spread, but no differences of frames.
     change = np.median(np.abs(np.diff(residual, axis=0)), axis=0)
     noise = change / (np.sqrt(2.0) * STANDARD_NORMAL_QUARTILE)
     by_spread = np.exp(spread) / STANDARD_NORMAL_QUARTILE
-    deviation = np.minimum(by_spread, _MAX_STD_OVER_DIFFERENCE_NOISE * noise)
+    deviation = np.minimum(by_spread, _MAX_STD_OVER_SAMPLE_STEP_NOISE * noise)
     fewest = max(_MIN_FRAMES_BESIDE_STEP, int(_MIN_SHARE_BESIDE_STEP * n))
 
     def inliers_and_centre(frames: Array) -> tuple[NDArray[np.bool_], Array]:
-        centre = ln_half_width_and_centre_of_calm_half(frames, np.full(6, 1e-300))[1]
+        centre = ln_half_width_and_centre(frames, np.full(6, 1e-300))[1]
         return (np.abs(frames - centre) <= _MAX_INLIER_DEVIATIONS * deviation).all(axis=1), centre
 
     whole = inliers_and_centre(residual)[0].sum()
@@ -340,9 +339,9 @@ class EpisodeSignals:
             poses = log.posed.poses
             spacing = max(MIN_POSES_PER_KNOT / poses.rate, _MIN_POSE_KNOT_SPACING_S)
             self._splines = PoseSplines(poses, spacing, smooth=True)
-        margin = _MOTION_MARGIN_FRAMES * TRIED_LAGS_PER_FRAME
-        steps = np.arange(-margin, len(log) * TRIED_LAGS_PER_FRAME + margin)
-        self._fine = self.motion(log.t[0] + steps / TRIED_LAGS_PER_FRAME * log.dt)
+        margin = _MOTION_MARGIN_FRAMES * NUM_LAGS_PER_FRAME
+        steps = np.arange(-margin, len(log) * NUM_LAGS_PER_FRAME + margin)
+        self._fine = self.motion(log.t[0] + steps / NUM_LAGS_PER_FRAME * log.dt)
 
     def motion(self, t: Array) -> Motion:
         log = self.log
@@ -355,10 +354,10 @@ class EpisodeSignals:
 
     def motion_at_lag(self, lag: float) -> Motion:
         """Return the motion (N, ...) at `lag` frames after each frame."""
-        first = (lag + _MOTION_MARGIN_FRAMES) * TRIED_LAGS_PER_FRAME
+        first = (lag + _MOTION_MARGIN_FRAMES) * NUM_LAGS_PER_FRAME
         step = round(first)
         if abs(step - first) < 1e-6 and abs(lag) < _MOTION_MARGIN_FRAMES:
-            rows = slice(step, step + TRIED_LAGS_PER_FRAME * len(self.log), TRIED_LAGS_PER_FRAME)
+            rows = slice(step, step + NUM_LAGS_PER_FRAME * len(self.log), NUM_LAGS_PER_FRAME)
             return Motion(*(x[rows] for x in self._fine))
         return self.motion(self.log.t + lag * self.log.dt)
 

@@ -24,11 +24,11 @@ from drake_teleop.logs.dataset.episode_verdict import EpisodeSignals, WrenchHypo
 from drake_teleop.logs.processing import phi_with_inertia_replaced
 from drake_teleop.logs.read.canonical import Log
 
-_MIN_RESIDUAL_HALF_WIDTH = np.repeat([1e-3, 1e-4], 3)  # N, N m
+_MIN_HALF_WIDTHS_N_NM = np.repeat([1e-3, 1e-4], 3)  # N, N m
 _EXCESS_SPREAD_LIMIT, _MAX_MEMBER_EXCESS_SPREAD = 6.0, 2.0
 _LAG_STEP_FRAMES, _MAX_LAG_FRAMES = 0.5, 3.0
 _MIN_CONTACT_DEVIATIONS, _CONTACT_MARGIN_FRAMES = 5.0, 2
-_THRESHOLD_OVER_MAX_CONTACT_FREE_LEVEL = 1.1
+_THRESHOLD_OVER_MAX_FREE_STATISTIC = 1.1
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class SharedLoad:
         phi: (10,) load that is removed.
         lag_frames: usual delay of the motion behind the wrench [frames].
         usual_half_widths: (6,) usual half widths of the residual [N, N m].
-        noise_floor, threshold: noise floor and threshold of contact detection.
+        noise_floor, threshold: for contact detection.
     """
 
     identification: Identification
@@ -61,10 +61,10 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
             remedy = "write wrench.sign: -1 into a --description file, or remove it if it is there"
             raise DrakeTeleopError(what, where="dataset", remedy=remedy)
 
-        def sum_of_limited_excess_spreads(phi: Array) -> float:
-            return sum(min(x.excess_spread(phi), _EXCESS_SPREAD_LIMIT) for x in episodes)
+        def robust_cost(phi: Array) -> float:
+            return sum(min(x.spread_above_own_fit(phi), _EXCESS_SPREAD_LIMIT) for x in episodes)
 
-        phi = min(candidates, key=sum_of_limited_excess_spreads)
+        phi = min(candidates, key=robust_cost)
         for _ in range(2):
             load = _fit_shared_load(_episodes_sharing_load(episodes, phi), phi)
             phi = load.phi
@@ -73,9 +73,9 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
     determined = np.isfinite(load.standard_deviations).all()
     phi = load.phi if determined else phi_with_inertia_replaced(load)[0]
     chosen = _episodes_sharing_load(episodes, phi)
-    usual = [x.faultless_hypothesis_and_residual(phi) for x in chosen]
-    steps = float(np.median([x.lag for x, _ in usual])) * episode_verdict.TRIED_LAGS_PER_FRAME
-    lag = round(steps) / episode_verdict.TRIED_LAGS_PER_FRAME
+    usual = [x.fault_free_hypothesis_and_residual(phi) for x in chosen]
+    steps = float(np.median([x.lag for x, _ in usual])) * episode_verdict.NUM_LAGS_PER_FRAME
+    lag = round(steps) / episode_verdict.NUM_LAGS_PER_FRAME
     typical = np.exp(np.median([x.spread for x, _ in usual], axis=0))
     limit, free = _MIN_CONTACT_DEVIATIONS * typical / episode_verdict.STANDARD_NORMAL_QUARTILE, []
     for episode, (x, residual) in zip(chosen, usual, strict=True):
@@ -88,14 +88,14 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
     floor = detection.fit_noise_floor(*pooled, covariance, fade=0.0)
     threshold = max(
         detection.NOISE_LEVEL_ONCE_PER_MILLION_SAMPLES,
-        _THRESHOLD_OVER_MAX_CONTACT_FREE_LEVEL * float(floor.free_maxima[0]),
+        _THRESHOLD_OVER_MAX_FREE_STATISTIC * float(floor.free_maxima[0]),
     )
     return SharedLoad(load, phi, lag, typical, floor, threshold)
 
 
 def fit_own_load_of_episode(signals: EpisodeSignals) -> WrenchHypothesis:
     """Return the hypothesis with the load and lag that explain one episode best."""
-    search = episode_verdict.HypothesisSearch(signals, np.zeros(10), 0.0, _MIN_RESIDUAL_HALF_WIDTH)
+    search = episode_verdict.HypothesisSearch(signals, np.zeros(10), 0.0, _MIN_HALF_WIDTHS_N_NM)
     lags = np.arange(-_MAX_LAG_FRAMES, _MAX_LAG_FRAMES + 0.1, _LAG_STEP_FRAMES)
     found = (search.hypothesis_of_other_load(float(lag)) for lag in lags)
     return min(found, key=lambda x: x.spread.sum())
@@ -105,26 +105,26 @@ class _FittedEpisode(NamedTuple):
     signals: EpisodeSignals
     own: WrenchHypothesis
 
-    def faultless_hypothesis_and_residual(self, phi: Array) -> tuple[WrenchHypothesis, Array]:
-        """Return the faultless hypothesis of load phi (10,) at the best lag, and its residual."""
-        lag, count = self.own.lag, episode_verdict.TRIED_LAGS_PER_FRAME
-        search = episode_verdict.HypothesisSearch(self.signals, phi, lag, _MIN_RESIDUAL_HALF_WIDTH)
+    def fault_free_hypothesis_and_residual(self, phi: Array) -> tuple[WrenchHypothesis, Array]:
+        """Return the best lag of load phi (10,) without faults, as hypothesis, and residual."""
+        lag, count = self.own.lag, episode_verdict.NUM_LAGS_PER_FRAME
+        search = episode_verdict.HypothesisSearch(self.signals, phi, lag, _MIN_HALF_WIDTHS_N_NM)
         lags = lag + np.arange(-count, count + 1) / count
         found = (
-            search.with_spread_and_cost(episode_verdict.hypothesis_without_fault(float(lag)))
+            search.with_spread_and_cost(episode_verdict.fault_free_hypothesis(float(lag)))
             for lag in lags
         )
         best = min(found, key=lambda x: x.spread.sum())
-        return best, search.unexplained_reading(best)
+        return best, search.reading_without_load(best)
 
-    def excess_spread(self, phi: Array) -> float:
-        """Return how much load phi (10,) increases the log spread, compared with the own load."""
-        usual = self.faultless_hypothesis_and_residual(phi)[0]
+    def spread_above_own_fit(self, phi: Array) -> float:
+        """Return the increase of the log spread by load phi (10,) instead of its own load."""
+        usual = self.fault_free_hypothesis_and_residual(phi)[0]
         return float(usual.spread.sum() - self.own.spread.sum())
 
 
 def _episodes_sharing_load(episodes: list[_FittedEpisode], phi: Array) -> list[_FittedEpisode]:
-    found = [x for x in episodes if x.excess_spread(phi) < _MAX_MEMBER_EXCESS_SPREAD]
+    found = [x for x in episodes if x.spread_above_own_fit(phi) < _MAX_MEMBER_EXCESS_SPREAD]
     return found or episodes
 
 
@@ -132,7 +132,7 @@ def _fit_shared_load(episodes: Sequence[_FittedEpisode], phi: Array) -> Identifi
     gram, right, squares, samples = np.zeros((10, 10)), np.zeros(10), np.zeros(6), 0
     offsets, delays, products, weights = [], [], [], []
     for episode in episodes:
-        x, r = episode.faultless_hypothesis_and_residual(phi)
+        x, r = episode.fault_free_hypothesis_and_residual(phi)
         sigma = np.exp(x.spread) / episode_verdict.STANDARD_NORMAL_QUARTILE
         rows = (np.abs(r - x.offsets) < _MIN_CONTACT_DEVIATIONS * sigma).all(axis=1)
         V, w = episode.signals.regressor_at_lag(x.lag)[rows], episode.signals.log.wrench[rows]

@@ -29,7 +29,7 @@ _MAX_FIT_FREQUENCY_OVER_SAMPLE_RATE = 0.45
 # Least gap that splines cannot bridge, and excluded margin beside it [s].
 _MIN_EXCLUDED_POSE_GAP_S, _GAP_MARGIN_S = 0.1, 0.4
 _MIN_SHARED_INSTANTS, _MIN_SHARED_INSTANTS_WITH_KNOWN_LOAD = 100, 32
-_MAX_JACOBIAN_OF_DETERMINED_ORIGIN = 1e-3  # by undetermined parameters
+_MAX_ORIGIN_SENSITIVITY = 1e-3  # by undetermined parameters
 _IDENTITY_ROTATION = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -87,9 +87,9 @@ class PoseEstimate(PoseMotion):
     """Load, delay and pose frame from a wrench and poses.
 
     Attributes:
-        fit: fit with the given origin and axes of the pose frame, if given.
+        fit: fit with the origin and axes of the pose frame that are given.
         free_frame_fit: fit with an estimated pose frame, `frame`.
-        units_and_axes: unit of positions, axes and masses from the linear model's fit.
+        units_and_axes: position unit, axes and masses that a linear model implies.
         t, rejected: (M,) instants [s], and flags, True at disturbances.
         note: text if disturbances could not be rejected.
     """
@@ -104,7 +104,7 @@ class PoseEstimate(PoseMotion):
 
     @property
     def theta(self) -> Array:
-        """Estimate (16,) of [offsets; phi] [SI]."""
+        """Estimated [offsets; phi] (16,) [SI]."""
         return self.fit.parameters.theta
 
     @property
@@ -127,7 +127,7 @@ def estimate_from_poses(
 ) -> PoseEstimate:
     """Estimate load, sensor offsets, delay and pose frame P from a wrench and poses of P.
 
-    The wrench (N, 6) at even times `t` is [f; tau] on the load, in S about So [N, N m]. Each of
+    The wrench (N, 6) at equidistant `t` is [f; tau] on the load, in S about So [N, N m]. Each of
     `p_SoPo_S` [m], `R_SP` and the delay of the poses behind the wrench [s] is estimated if None,
     else kept. `gain_std` is the standard deviation of the sensor gains. Samples with `lost` True
     are excluded. IMU data of S are used if they fit the wrench better.
@@ -141,7 +141,7 @@ def estimate_from_poses(
         window = replace(window, taper=spectra.exclude_from_taper(window.taper, rejected, grid.dt))
         final = window.spectra_at_delay(splines, late)
         Z = final.second_moments_with_rates()
-        Q = spectra.noise_moments(splines, final, splines.estimate_pose_noise())
+        Q = spectra.pose_noise_moments(splines, final, splines.estimate_pose_noise())
         levels = linear_model.fit_noise_levels(Z, window.bands)
         best = linear_model.fit_linear_model(Z, levels)
 
@@ -216,18 +216,18 @@ def _fit_pose_splines_and_delay(
     fewest = _MIN_SHARED_INSTANTS if free_load else _MIN_SHARED_INSTANTS_WITH_KNOWN_LOAD
     if usable < fewest:
         what = f"wrench and poses share {usable} instants, {grid.dt:.2g} s apart"
-        what += f" ({fewest} required; gaps of the poses above {_MIN_EXCLUDED_POSE_GAP_S} s and"
+        what += f" ({fewest} required, without pose gaps above {_MIN_EXCLUDED_POSE_GAP_S} s"
         remedy = "record both at the same time, longer, without interruptions, above 10 Hz"
-        raise DrakeTeleopError(f"{what} {_GAP_MARGIN_S} s beside them are excluded)", remedy=remedy)
+        raise DrakeTeleopError(f"{what} and {_GAP_MARGIN_S} s beside each gap)", remedy=remedy)
     slower = min(poses.rate, grid.stride / grid.dt)
     top = min(spectra.MAX_FREQUENCY_HZ, _MAX_FIT_FREQUENCY_OVER_SAMPLE_RATE * slower)
     whole = FitWindow(grid, taper, gravity, top)
-    part = whole.select_and_taper_rows(_slice_of_largest_force_variance(grid))
+    part = whole.select_and_taper_rows(_rows_with_largest_force_variance(grid))
     margin = 2 * spectra.DELAY_SEARCH_HALF_RANGE_S
     near = (poses.t >= part.grid.t[0] - margin) & (poses.t <= part.grid.t[-1] + margin)
     near_poses = Poses(poses.t[near], poses.position[near], poses.quaternion[near])
     cache = linear_model.spline_cache_of_averaged_poses(near_poses)
-    spacing, late = linear_model.guess_knot_spacing_and_delay(part, cache, guess, known=known)
+    spacing, late = linear_model.guess_knot_spacing_and_delay(part, cache, guess, fixed=known)
     first = part.spectra_at_delay(PoseSplines(near_poses, spacing), late)
     disturbed = find_disturbances(first, spacing)[0]
     part = replace(part, taper=spectra.exclude_from_taper(part.taper, disturbed, grid.dt))
@@ -242,7 +242,7 @@ def _fit_pose_splines_and_delay(
         choices += [] if imu_rows is None else [SplineCache(cache.poses, imu_rows)]
     agrees = imu is None or imu_rows is not None
     chosen, spacing, late = linear_model.choose_knot_spacing_and_delay(
-        part, choices, late, known=known
+        part, choices, late, fixed=known
     )
     imu_rows = chosen.imu_rows
     if imu_rows is not None and imu is not None and len(near_poses.t) < len(poses.t):
@@ -252,7 +252,7 @@ def _fit_pose_splines_and_delay(
     return PoseMotion(splines, last.delay, np.inf, rate, agrees), last, whole
 
 
-def _slice_of_largest_force_variance(grid: WrenchGrid) -> slice:
+def _rows_with_largest_force_variance(grid: WrenchGrid) -> slice:
     rows, length = len(grid.t), round(_MAX_DELAY_SEARCH_RECORD_SPAN_S / grid.dt)
     if rows <= length:
         return slice(0, rows)
@@ -288,7 +288,7 @@ def _pose_frame_from_free_fit(free: RigidFit, described: RigidParameters) -> Pos
     finite = np.where(known[:, None] & known, covariance, 0.0)
     deviations = np.sqrt(np.diag(jacobian @ finite @ jacobian.T))
     if not known.all():
-        lost = np.abs(jacobian[:, ~known]).max(axis=1) > _MAX_JACOBIAN_OF_DETERMINED_ORIGIN
+        lost = np.abs(jacobian[:, ~known]).max(axis=1) > _MAX_ORIGIN_SENSITIVITY
         deviations = np.where(lost, np.inf, deviations)
     moved = free.parameters.p_PoSo_P - described.p_PoSo_P
     turned = Rotation.from_matrix(described.R_PS.T @ free.parameters.R_PS).as_rotvec()

@@ -49,8 +49,8 @@ class LinearFit:
     """Fit of the wrench by free coefficients of 16 signals of the motion.
 
     Attributes:
-        coefficients: (6, 16); their product with the signals is the wrench; 0 for zero signals.
-        covariance: (6, 16, 16) of the rows of coefficients.
+        coefficients: (6, 16); their product with the signals is the wrench; 0 for absent signals.
+        covariance: (6, 16, 16) of each row of coefficients.
         noise_power: (bands, 6) mean noise power.
         channel_costs: (6,) negative log likelihood of each channel.
     """
@@ -67,9 +67,9 @@ class LinearFit:
 
 
 def fit_linear_model(Z: Array, levels: NoiseLevels, load: Array | None = None) -> LinearFit:
-    """Fit the wrench by 16 signals, from second moments Z (..., bands, n, n) of `Spectra`.
+    """Fit the wrench by 16 signals, from their second moments Z (..., bands, n, n).
 
-    With the coefficients `load` (6, 16) only the offsets are fitted.
+    If the coefficients `load` (6, 16) are given, only offsets are fitted.
     """
     zz, zf = (Z[..., :NUM_MOTION_SIGNALS, x] for x in (slice(NUM_MOTION_SIGNALS), WRENCH_COLUMNS))
     ff, floor = _wrench_channel_powers(Z), min_noise_power(Z, levels)
@@ -120,15 +120,15 @@ def _pseudo_inverses_of_grams(gram: Array) -> Array:
 
 
 def min_noise_power(Z: Array, levels: NoiseLevels) -> Array:
-    """Return a lower limit (..., 1, 6) of noise power, due to rounded numbers of the wrench."""
+    """Return a lower limit (..., 1, 6) of noise power, a small share of the wrench's power."""
     power = _wrench_channel_powers(Z).sum(axis=-2, keepdims=True) / levels.half_dof_of_bands.sum()
     both = power.reshape(*power.shape[:-1], 2, 3).sum(axis=-1).repeat(3, axis=-1)
     return np.maximum(MIN_NOISE_STD_OVER_WRENCH_RMS**2 * both, 1e-60)
 
 
 def fit_noise_levels(Z: Array, bands: FrequencyBands) -> NoiseLevels:
-    """Return noise levels; a channel's noise is white, plus a random walk if likelier (T74)."""
-    levels = NoiseLevels.white_within_groups(bands)
+    """Return noise levels from second moments Z: white, plus a random walk if likelier (T74)."""
+    levels = NoiseLevels.white_noise_in_each_group(bands)
     least = fit_linear_model(Z, levels).channel_costs - _MIN_LOG_LIKELIHOOD_GAIN_BY_DRIFT
     shape = levels.relative_power.copy()
     for corner in _TRIED_OFFSET_DRIFT_CORNERS_HZ:
@@ -141,7 +141,7 @@ def fit_noise_levels(Z: Array, bands: FrequencyBands) -> NoiseLevels:
 
 def fit_coefficients(spectra: Spectra) -> LinearFit:
     """Fit the coefficients of all signals, or only the offsets if the load is known."""
-    levels = NoiseLevels.white_within_groups(spectra.window.bands)
+    levels = NoiseLevels.white_noise_in_each_group(spectra.window.bands)
     return fit_linear_model(spectra.second_moments(), levels, spectra.window.grid.known_load)
 
 
@@ -149,7 +149,7 @@ def _costs_at_delays(spectra: Spectra, delays: Array) -> Array:
     window, Z = spectra.window, spectra.second_moments_at_delays(delays)
     wrench = np.arange(NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS + 6)
     Z[..., wrench, wrench] = window.bands.sums_over_bands(np.abs(window.wrench_spectrum) ** 2)
-    levels = NoiseLevels.white_within_groups(window.bands)
+    levels = NoiseLevels.white_noise_in_each_group(window.bands)
     return fit_linear_model(Z, levels, window.grid.known_load).channel_costs.sum(axis=-1)
 
 
@@ -184,13 +184,13 @@ def delay_std(spectra: Spectra) -> float:
 
 
 def guess_knot_spacing_and_delay(
-    window: FitWindow, cache: SplineCache, delay: float, *, known: bool
+    window: FitWindow, cache: SplineCache, delay: float, *, fixed: bool
 ) -> tuple[float, float]:
-    """Return likeliest knot spacing and delay [s] on a coarse grid; a `known` delay is kept."""
+    """Return likeliest knot spacing and delay [s] on a coarse grid; a `fixed` delay is kept."""
     found, reach = [], window.delay_search_half_range_s
     for h in _knot_spacings_allowed_by_pose_rate(cache)[::2]:
         spectra, late = window.spectra_at_delay(cache.splines_with_spacing(h), delay), delay
-        if known:
+        if fixed:
             cost = fit_coefficients(spectra).cost
         else:
             late, cost = find_best_delay_and_cost(spectra, reach, _FINE_DELAY_STEP_S)
@@ -199,19 +199,19 @@ def guess_knot_spacing_and_delay(
 
 
 def choose_knot_spacing_and_delay(
-    window: FitWindow, choices: Sequence[SplineCache], delay: float, *, known: bool
+    window: FitWindow, caches: Sequence[SplineCache], delay: float, *, fixed: bool
 ) -> tuple[SplineCache, float, float]:
-    """Return splines, knot spacing [s] and delay [s] of about the highest likelihood.
+    """Return splines, knot spacing [s] and delay [s] near the highest likelihood.
 
-    Knots are closer than at the highest likelihood: by 8 % with a known load, else by 16 %. The
-    delay is not changed if `known`.
+    Knots are closer by 8 % for a known load, else by 16 %, for a smaller bias. The delay is
+    kept if `fixed`.
     """
 
     def spectra_of(cache: SplineCache, knot_spacing_s: float) -> Spectra:
         return window.spectra_at_delay(cache.splines_with_spacing(knot_spacing_s), delay)
 
     found = []
-    for cache in choices:
+    for cache in caches:
         spacings = _knot_spacings_allowed_by_pose_rate(cache)
         costs = [(fit_coefficients(spectra_of(cache, h)).cost, h) for h in spacings]
         k = spacings.index(min(costs)[1])
@@ -222,7 +222,7 @@ def choose_knot_spacing_and_delay(
     _, best, cache = min(found, key=lambda x: x[:2])
     finer = _SPACING_OVER_BEST if window.grid.known_load is None else _SPACING_OVER_BEST_KNOWN_LOAD
     best = max(finer * best, MIN_POSES_PER_KNOT / cache.rate)
-    if not known:
+    if not fixed:
         reach = 3 * _COARSE_DELAY_STEP_S
         delay, _ = find_best_delay_and_cost(spectra_of(cache, best), reach)
     return cache, best, delay
@@ -247,7 +247,7 @@ _MAX_DELAY_CHANGE_BY_CLOCK_DRIFT_S = 0.2
 def estimate_clock_rate_error(
     window: FitWindow, cache: SplineCache, delay: float, spacing: float
 ) -> float:
-    """Return the relative rate error of the poses' clock, such as 5e-5, or 0 if insignificant."""
+    """Return the relative rate error of the poses' clock, > 0 if fast; 0 if insignificant."""
     now, best = window.spectra_at_delay(cache.splines_with_spacing(spacing), delay), 0.0
     grid, least = window.grid, fit_coefficients(now).cost
     start = least

@@ -44,7 +44,7 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class ImuData:
-    """IMU data (K, 3) at So, in S, at times t (K,) [s]; None for an absent sensor."""
+    """Specific force and angular velocity (K, 3) of So in S at times t (K,) [s]; None if absent."""
 
     t: Array
     specific_force: Array | None
@@ -72,7 +72,7 @@ class ImuData:
 class PosesOfLog:
     """Poses of frame P in a log, with gravity (3,) in the world [m/s^2].
 
-    `p_SoPo_S` (3,) [m], `R_SP` (3, 3): P in the sensor's frame S, by the description.
+    `p_SoPo_S` (3,) [m] and `R_SP` (3, 3) are origin and axes of P in S as described.
     """
 
     poses: Poses

@@ -15,7 +15,7 @@ from drake_teleop.load.identification import mark_undetermined
 from drake_teleop.load.normal_equations import centripetal_matrix, regressor_coefficients
 from drake_teleop.logs.pose_motion import spectra
 from drake_teleop.logs.pose_motion.linear_model import LinearFit, min_noise_power
-from drake_teleop.logs.pose_motion.spectra import NUM_MOMENT_SIGNALS, WRENCH_COLUMNS, NoiseLevels
+from drake_teleop.logs.pose_motion.spectra import NUM_SPECTRAL_COLUMNS, WRENCH_COLUMNS, NoiseLevels
 from drake_teleop.logs.pose_motion.splines import GRAVITY_COLUMNS, NUM_MOTION_SIGNALS
 
 NUM_RIGID_PARAMETERS = 23
@@ -46,9 +46,9 @@ class RigidFit:
 
     Attributes:
         parameters: estimated; `delay_s` is relative to the delay of the `Spectra`.
-        covariance: (23, 23) of [theta, tau, r, rotation about the axes of S]; inf on the diagonal
-            if undetermined, 0 if not free.
-        misfit: twice the log likelihood ratio to the linear model.
+        covariance: (23, 23) of [offsets, phi, delay, p_PoSo_P, rotation about the axes of S]; inf
+            on the diagonal if undetermined, 0 if not free.
+        misfit: twice the log likelihood ratio to the free linear model.
         degrees_of_freedom: those of the misfit.
         expected_misfit_by_gains: expected increase of the misfit by the stated gain errors.
     """
@@ -78,7 +78,7 @@ class RigidFit:
 
 
 def motion_transformation_matrix(R_PS: Array, p_PoSo_P: Array) -> Array:
-    """Return M (19, 22), (T79), from [16 signals of P; wrench] to [1; wrench; motion of S]."""
+    """Return M (19, 22), (T79): M [16 signals of P; wrench] = [1; wrench; 12 signals of S]."""
     M = np.zeros((19, NUM_MOTION_SIGNALS + 6))
     M[0, 0] = 1.0
     M[1:7, NUM_MOTION_SIGNALS:] = np.eye(6)
@@ -94,7 +94,7 @@ def motion_transformation_matrix(R_PS: Array, p_PoSo_P: Array) -> Array:
 def wrench_coefficients_of_load(phi: Array, removed_weight: Array | None = None) -> Array:
     """Return C (6, 16), Eq. (T73): C times the 16 motion signals is the wrench of load phi (10,).
 
-    It excludes the wrench of gravity on `removed_weight` [m, m c] (4,).
+    The robot has subtracted the `removed_weight` [m, m c] (4,).
     """
     M = motion_transformation_matrix(np.eye(3), np.zeros(3))[:, :NUM_MOTION_SIGNALS]
 
@@ -119,10 +119,10 @@ def fit_rigid(
     *,
     gain_std: float = 0.0,
 ) -> RigidFit:
-    """Fit a rigid load; all bands get one weight if no rigid load explains the wrench.
+    """Fit a rigid load; all bands have equal weights if no rigid load explains the wrench.
 
-    Z (bands, 38, 38) are `Spectra.second_moments_with_rates`, Q the part by noise of the poses.
-    Parameters with `free` (23,) True are estimated. The first weights are those of `linear`.
+    Z (bands, 38, 38) are the second moments of signals, wrench and signal rates; Q is their part
+    due to pose noise. Parameters with `free` (23,) True are estimated, from `start`.
     """
     record = _RigidFitData(Z, Q, levels, free, linear.noise_power)
     solution = _solve_rigid_fit(record, start)
@@ -164,35 +164,35 @@ class _RigidSolution:
 
 
 def _solve_rigid_fit(
-    record: _RigidFitData, state: RigidParameters, *, equal_band_weights: bool = False
+    record: _RigidFitData, params: RigidParameters, *, equal_band_weights: bool = False
 ) -> _RigidSolution:
     sizes, clean = record.noise_levels.half_dof_of_bands, record.moments - record.noise_moments
-    R = _residual_covariances(record, state, record.linear_noise_power * sizes[:, None])
+    R = _residual_covariances(record, params, record.linear_noise_power * sizes[:, None])
     for _ in range(_MAX_RIGID_FIT_STEPS):
         W: Array = np.linalg.inv(R).astype(np.float64)
         if equal_band_weights:
             W[:] = np.linalg.inv(np.einsum("b,bcd->cd", sizes / sizes.sum(), R))
-        B, Le = _residual_and_derivative(state)
+        B, Le = _residual_and_derivative(params)
         gram, right = _normal_equations(B, Le, clean, W)
         inverse, undetermined = _invert_gram_and_flag_undetermined(gram, record.is_free)
         step = inverse @ right
         size = np.sqrt(np.maximum(np.diag(inverse), 0.0)) + 1e-300
         step *= min(1.0, float(np.min(_MAX_GAUSS_NEWTON_STEP / np.maximum(np.abs(step), 1e-300))))
-        state = _add_increments(state, step)
+        params = _add_increments(params, step)
         half = np.einsum("cjk,ji->cik", B, inverse)
         used = np.einsum("cik,bkm,cim->bc", half, record.moments, B, optimize=True)
         used = np.clip(used * np.diagonal(W, axis1=1, axis2=2), 0.0, None)
-        R = _residual_covariances(record, state, _residual_channel_powers(record, state), used)
+        R = _residual_covariances(record, params, _residual_channel_powers(record, params), used)
         if np.max(np.abs(step) / size) < _MAX_CONVERGED_STEP_OVER_STD:
             break
-    return _RigidSolution(state, B, W, inverse, R, undetermined)
+    return _RigidSolution(params, B, W, inverse, R, undetermined)
 
 
 def _parameter_covariance(
     record: _RigidFitData, solution: _RigidSolution, inflation: float, wrench_gain_std: float
 ) -> Array:
     inverse, undetermined = solution.inverse_gram, solution.is_undetermined
-    W, none = solution.residual_weights, np.zeros((6, NUM_MOMENT_SIGNALS))
+    W, none = solution.residual_weights, np.zeros((6, NUM_SPECTRAL_COLUMNS))
     W = W @ solution.residual_covariances @ W
     middle = _normal_equations(solution.residual_derivative, none, record.moments, W)[0]
     covariance = 0.5 * inverse @ middle @ inverse
@@ -219,36 +219,36 @@ def _std_inflation_by_estimated_weights(record: _RigidFitData, solution: _RigidS
     return np.sqrt(1.0 + 4.0 * np.sum(share * (1.0 - share) / freedom[:, None], axis=0))
 
 
-def _delayed_motion_transformation(state: RigidParameters) -> Array:
-    M = motion_transformation_matrix(state.R_PS, state.p_PoSo_P)
-    return np.hstack([M, state.delay_s * M[:, :NUM_MOTION_SIGNALS]])
+def _delayed_motion_transformation(params: RigidParameters) -> Array:
+    M = motion_transformation_matrix(params.R_PS, params.p_PoSo_P)
+    return np.hstack([M, params.delay_s * M[:, :NUM_MOTION_SIGNALS]])
 
 
-def _residual_wrench_coefficients(state: RigidParameters) -> Array:
-    L = -np.einsum("cjk,j->ck", regressor_coefficients(), state.theta)
+def _residual_wrench_coefficients(params: RigidParameters) -> Array:
+    L = -np.einsum("cjk,j->ck", regressor_coefficients(), params.theta)
     L[np.arange(6), np.arange(1, 7)] += 1.0
     return L
 
 
-def _residual_and_derivative(state: RigidParameters) -> tuple[Array, Array]:
-    """Return B = -de/dx (6, 23, 38), e (6, 38); e times 38 signals is the residual wrench."""
-    L, M = _residual_wrench_coefficients(state), _delayed_motion_transformation(state)
+def _residual_and_derivative(params: RigidParameters) -> tuple[Array, Array]:
+    """Return -de/dx (6, 23, 38) by 23 parameters, e (6, 38): e times 38 signals is the residual."""
+    L, M = _residual_wrench_coefficients(params), _delayed_motion_transformation(params)
     step = _ROTATION_DIFFERENCE_STEP_RAD
-    B = np.zeros((6, NUM_RIGID_PARAMETERS, NUM_MOMENT_SIGNALS))
+    B = np.zeros((6, NUM_RIGID_PARAMETERS, NUM_SPECTRAL_COLUMNS))
     B[:, OFFSET_AND_LOAD_PARAMETERS] = regressor_coefficients() @ M
-    B[:, DELAY_PARAMETER, spectra.SIGNAL_RATE_COLUMNS] = -(L @ M)[:, None, :NUM_MOTION_SIGNALS]
+    B[:, DELAY_PARAMETER, spectra.SIGNAL_RATE_SLICE] = -(L @ M)[:, None, :NUM_MOTION_SIGNALS]
     for i, unit in enumerate(np.eye(3)):
-        lever = _delayed_motion_transformation(replace(state, p_PoSo_P=state.p_PoSo_P + unit)) - M
-        turned = (_rotate_about_own_axes(state.R_PS, x * unit) for x in (step, -step))
-        ahead, behind = (_delayed_motion_transformation(replace(state, R_PS=R)) for R in turned)
+        lever = _delayed_motion_transformation(replace(params, p_PoSo_P=params.p_PoSo_P + unit)) - M
+        turned = (_rotate_about_own_axes(params.R_PS, x * unit) for x in (step, -step))
+        ahead, behind = (_delayed_motion_transformation(replace(params, R_PS=R)) for R in turned)
         B[:, 17 + i] = -L @ lever
         B[:, 20 + i] = -L @ (ahead - behind) / (2.0 * step)
     return B, L @ M
 
 
 def _normal_equations(B: Array, Le: Array, Z: Array, W: Array) -> tuple[Array, Array]:
-    columns = B.reshape(-1, NUM_MOMENT_SIGNALS)
-    BZ = (columns @ Z).reshape(len(Z), 6, NUM_RIGID_PARAMETERS, NUM_MOMENT_SIGNALS)
+    columns = B.reshape(-1, NUM_SPECTRAL_COLUMNS)
+    BZ = (columns @ Z).reshape(len(Z), 6, NUM_RIGID_PARAMETERS, NUM_SPECTRAL_COLUMNS)
     WB = np.einsum("bcd,bcjk->dbjk", W, BZ, optimize=True)
     gram = np.einsum("dbjk,dik->ji", WB, B, optimize=True)
     return 0.5 * (gram + gram.T), np.einsum("dbjk,dk->j", WB, Le, optimize=True)
@@ -267,20 +267,20 @@ def _invert_gram_and_flag_undetermined(
     return (basis / values[kept]) @ basis.T, free & (~used | null)
 
 
-def _residual_cross_powers(Z: Array, state: RigidParameters) -> Array:
-    Le = _residual_wrench_coefficients(state) @ _delayed_motion_transformation(state)
+def _residual_cross_powers(Z: Array, params: RigidParameters) -> Array:
+    Le = _residual_wrench_coefficients(params) @ _delayed_motion_transformation(params)
     return np.asarray(Le @ Z @ Le.T)
 
 
-def _residual_channel_powers(record: _RigidFitData, state: RigidParameters) -> Array:
-    return np.asarray(np.diagonal(_residual_cross_powers(record.moments, state), axis1=1, axis2=2))
+def _residual_channel_powers(record: _RigidFitData, params: RigidParameters) -> Array:
+    return np.asarray(np.diagonal(_residual_cross_powers(record.moments, params), axis1=1, axis2=2))
 
 
 def _residual_covariances(
-    record: _RigidFitData, state: RigidParameters, power_sums: Array, used_dof: Array | None = None
+    record: _RigidFitData, params: RigidParameters, power_sums: Array, used_dof: Array | None = None
 ) -> Array:
     levels, sizes = record.noise_levels, record.noise_levels.half_dof_of_bands[:, None]
-    P = _residual_cross_powers(record.noise_moments, state) / sizes[..., None]
+    P = _residual_cross_powers(record.noise_moments, params) / sizes[..., None]
     own = np.diagonal(P, axis1=1, axis2=2) * (sizes if used_dof is None else sizes - 0.5 * used_dof)
     least = np.maximum(
         _MIN_WRENCH_NOISE_OVER_RESIDUAL * levels.noise_power(power_sums, used_dof),
@@ -291,7 +291,7 @@ def _residual_covariances(
 
 
 def _parameter_errors_by_unit_gain_errors(solution: _RigidSolution, Z: Array) -> Array:
-    BF = (solution.residual_derivative.reshape(-1, NUM_MOMENT_SIGNALS) @ Z)[:, :, WRENCH_COLUMNS]
+    BF = (solution.residual_derivative.reshape(-1, NUM_SPECTRAL_COLUMNS) @ Z)[:, :, WRENCH_COLUMNS]
     BF = BF.reshape(len(Z), 6, NUM_RIGID_PARAMETERS, 6)
     return parameter_errors_by_gains(BF, solution.residual_weights, solution.inverse_gram)
 
@@ -305,19 +305,19 @@ def _expected_misfit_by_gain_errors(
     effects = _parameter_errors_by_unit_gain_errors(solution, record.moments)
     left = -np.einsum("cjk,ji->cik", B, effects)
     length = np.repeat([1.0, GAIN_ERROR_TORQUE_ARM_M], 3)
-    left = left.reshape(6, 6, 6, NUM_MOMENT_SIGNALS)  # of channel c by gain d, k
+    left = left.reshape(6, 6, 6, NUM_SPECTRAL_COLUMNS)  # of channel c by gain d, k
     for c in range(6):
         left[c, c, :, WRENCH_COLUMNS] += np.diag(length[c] / length)
-    left = left.reshape(6, 36, NUM_MOMENT_SIGNALS)
+    left = left.reshape(6, 36, NUM_SPECTRAL_COLUMNS)
     sums = gain_std**2 * np.einsum("cik,bkm,cim->bc", left, record.moments, left, optimize=True)
     more = levels.noise_power(np.maximum(sums, 0.0)) / record.linear_noise_power
     return 2.0 * float(levels.negative_log_likelihoods(1.0 + more).sum())
 
 
-def _add_increments(state: RigidParameters, increment: Array) -> RigidParameters:
-    theta = state.theta + increment[OFFSET_AND_LOAD_PARAMETERS]
-    delay_s, p = state.delay_s + float(increment[16]), state.p_PoSo_P + increment[LEVER_PARAMETERS]
-    R = _rotate_about_own_axes(state.R_PS, increment[ROTATION_PARAMETERS])
+def _add_increments(params: RigidParameters, change: Array) -> RigidParameters:
+    theta = params.theta + change[OFFSET_AND_LOAD_PARAMETERS]
+    delay_s, p = (params.delay_s + float(change[16]), params.p_PoSo_P + change[LEVER_PARAMETERS])
+    R = _rotate_about_own_axes(params.R_PS, change[ROTATION_PARAMETERS])
     return RigidParameters(theta, delay_s, p, Rotation.from_matrix(R).as_matrix())
 
 
@@ -335,7 +335,7 @@ class UnitsAndAxes:
     Attributes:
         position_unit_ratio: unit error kappa of position; 1e-3 for mm described as m.
         position_unit_ratio_std: its standard deviation; inf if undetermined.
-        max_mass_std_kg: largest standard deviation in M_g (3, 3); the weight is M_g (-gravity).
+        max_mass_std_kg: largest standard deviation in M_g (3, 3), where force = M_g (-gravity).
         R_SP: (3, 3) polar factor of M_g; determinant -1 if mirrored.
         axis_masses_kg: (3,) singular values of M_g [kg].
     """

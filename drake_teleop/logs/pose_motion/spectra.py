@@ -32,18 +32,17 @@ _GROUP_EDGES_HZ = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0
 _MIN_FREQUENCIES_PER_NOISE_GROUP = 8.0
 # Largest ratio of the ends of a band below this frequency [Hz].
 _MAX_NARROW_BAND_FREQUENCY_HZ, _MAX_NARROW_BAND_EDGE_RATIO = 3.0, 4.0 / 3.0
-NUM_MOMENT_SIGNALS = 2 * NUM_MOTION_SIGNALS + 6
+NUM_SPECTRAL_COLUMNS = 2 * NUM_MOTION_SIGNALS + 6
 # Columns of the wrench and of the signals' derivatives in `second_moments`.
 WRENCH_COLUMNS = slice(NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS + 6)
-SIGNAL_RATE_COLUMNS = slice(NUM_MOTION_SIGNALS + 6, NUM_MOMENT_SIGNALS)
+SIGNAL_RATE_SLICE = slice(NUM_MOTION_SIGNALS + 6, NUM_SPECTRAL_COLUMNS)
 
 
 @dataclass(frozen=True, eq=False)
 class WrenchGrid:
-    """Grid t (M,) of the motion signals [s] at a rate below 200 Hz, and samples of the wrench.
+    """Uniform times t (M,) of motion signals [s], below 200 Hz, and the wrench (M stride, 6).
 
-    `wrench` (N, 6) has `stride` samples for each instant. `known_load` (6, 16) are the
-    coefficients of a known load, Eq. (T73).
+    `known_load` (6, 16) are the coefficients of a known load, Eq. (T73).
     """
 
     t: Array
@@ -126,7 +125,7 @@ def exclude_from_taper(
 
 @dataclass(frozen=True, eq=False)
 class FitWindow:
-    """Data of a fit: weights `taper` (M,), gravity (3,) [m/s^2], highest frequency [Hz]."""
+    """Time window of a fit: weights `taper` (M,), gravity (3,) [m/s^2], highest frequency [Hz]."""
 
     grid: WrenchGrid
     taper: Array
@@ -156,7 +155,7 @@ class FitWindow:
 
     @cached_property
     def wrench_spectrum(self) -> ComplexArray:
-        """Spectrum (K, 6) of the tapered wrench, scaled as by `signal_spectrum`."""
+        """Spectrum (K, 6) of the tapered wrench at the grid rate."""
         stride, n = self.grid.stride, len(self.grid.wrench)
         fine = np.zeros(self.grid.transform_length * stride)
         full = np.interp(np.arange(n) / stride, np.arange(len(self.taper)), self.taper)
@@ -172,7 +171,7 @@ class FitWindow:
 
     @cached_property
     def is_taper_fixed(self) -> bool:
-        """Whether a delay shifts only the signals, not the taper: for gaps, or a known load."""
+        """Whether a delay shifts only the signals, not the taper: with gaps or a known load."""
         inside = np.flatnonzero(self.taper > 0.5)
         edged = len(inside) > 0 and len(inside) <= inside[-1] - inside[0]
         return bool(edged or self.grid.known_load is not None)
@@ -186,7 +185,7 @@ class FitWindow:
         return out
 
     def filtered_taper(self, response: NDArray[np.complexfloating]) -> Array:
-        """Return the zero-padded taper (M,), filtered by a `response` at each grid frequency."""
+        """Return the taper (M,), filtered by a frequency `response` on the grid."""
         n = self.grid.transform_length
         return np.asarray(np.fft.irfft(np.fft.rfft(self.taper, n) * response, n)[: len(self.taper)])
 
@@ -218,7 +217,7 @@ class Spectra:
     motion_signals: Array
 
     def with_delay(self, delay: float) -> Spectra:
-        """Return the spectra with `signals` at another delay [s]."""
+        """Return the spectra with motion signals at another delay [s]."""
         window, shift, signals = self.window, delay - self.delay, self.signals
         if window.is_taper_fixed:
             before = window.filtered_taper(np.exp(-2j * np.pi * window.grid.frequency * shift))
@@ -241,7 +240,7 @@ class Spectra:
         return second_moments(window.bands, self.signals, window.wrench_spectrum, rates)
 
     def second_moments_at_delays(self, delays: Array) -> Array:
-        """Return second moments (D, bands, 22, 22) at delays (D,) [s], valid in rows of signals."""
+        """Return second moments (D, bands, 22, 22) at delays (D,) [s], valid in signal rows."""
         bands, wrench = self.window.bands, self.window.wrench_spectrum
         if self.window.is_taper_fixed:
             return np.array([self.with_delay(delay).second_moments() for delay in delays])
@@ -261,13 +260,13 @@ class Spectra:
 
 
 def real_and_imaginary_rows(y: ComplexArray) -> Array:
-    """Return real rows (2 K, k): the real, then the imaginary part of each row of y (K, k)."""
+    """Return rows (2 K, k): real and imaginary part alternate for each row of y (K, k)."""
     parts = y.view(np.float64).reshape(*y.shape, 2)
     return parts.transpose(0, 2, 1).reshape(-1, y.shape[1])
 
 
 def second_moments(bands: FrequencyBands, *spectra: ComplexArray) -> Array:
-    """Return the sums of Re y* y^T (bands, n, n) in each band, for spectra y of n columns."""
+    """Return sums of Re conj(y) y^T (bands, n, n) in each band, for spectra y of n columns."""
     y = np.hstack(spectra) * np.sqrt(bands.frequency_weight)[:, None]
     # Real and imaginary parts as rows need only one real product per band.
     parts = (real_and_imaginary_rows(y[part]) for part in bands.slices)
@@ -289,13 +288,13 @@ class NoiseLevels:
     relative_power: Array
 
     @classmethod
-    def white_within_groups(cls, bands: FrequencyBands) -> NoiseLevels:
+    def white_noise_in_each_group(cls, bands: FrequencyBands) -> NoiseLevels:
         return cls(bands.half_dof_of_bands, bands.group_of_band, np.ones((bands.num_bands, 6)))
 
     def noise_power(self, sums: Array, used: Array | None = None) -> Array:
         """Return the noise power (..., bands, 6) of residuals, from `sums` of squares in bands.
 
-        `used` (bands, 6) are the degrees of freedom of fitted parameters.
+        `used` (bands, 6) degrees of freedom are those of fitted parameters.
         """
         remaining = self.sums_over_groups(self.half_dof_of_bands)[:, None]
         if used is not None:
@@ -328,8 +327,8 @@ OMEGA_PRODUCT_COLUMNS = np.array([[10, 13, 14], [13, 11, 15], [14, 15, 12]])
 _ACCELERATION_COLUMNS, _GRAVITY_COLUMNS, _ALPHA_COLUMNS = slice(1, 4), slice(4, 7), slice(7, 10)
 
 
-def noise_moments(splines: PoseSplines, spectra: Spectra, noise: tuple[float, float]) -> Array:
-    """Return the part (bands, 38, 38) of `Spectra.second_moments_with_rates` by noise of the poses.
+def pose_noise_moments(splines: PoseSplines, spectra: Spectra, noise: tuple[float, float]) -> Array:
+    """Return second moments (bands, 38, 38) of signals, wrench, signal rates due to pose noise.
 
     `noise`: standard deviations of position [m] and rotation [rad].
     """
@@ -344,8 +343,8 @@ def noise_moments(splines: PoseSplines, spectra: Spectra, noise: tuple[float, fl
     weight = taper**2 / np.sum(taper**2)
     shapes = _signal_covariances_by_unit_pose_noise(spectra.motion_signals, weight)
     powers = position_power * w2**2, rotation_power, rotation_power * w2, rotation_power * w2**2
-    Q = np.zeros((bands.num_bands, NUM_MOMENT_SIGNALS, NUM_MOMENT_SIGNALS))
-    signals, rates = slice(0, NUM_MOTION_SIGNALS), SIGNAL_RATE_COLUMNS
+    Q = np.zeros((bands.num_bands, NUM_SPECTRAL_COLUMNS, NUM_SPECTRAL_COLUMNS))
+    signals, rates = slice(0, NUM_MOTION_SIGNALS), SIGNAL_RATE_SLICE
     for power, shape in zip(powers, shapes, strict=True):
         Q[:, signals, signals] += bands.sums_over_bands(power)[:, None, None] * shape
         Q[:, rates, rates] += bands.sums_over_bands(power * w2)[:, None, None] * shape

@@ -51,7 +51,7 @@ class ImuSplineRows:
     def with_data_in_sensor_axes(
         self, splines: PoseSplines, gravity_W: Array, s: Array | None, omega: Array | None
     ) -> ImuSplineRows:
-        """Return the rows with acceleration and quaternion rate from s and omega (K, 3) in S."""
+        """Return rows in the world from specific force s and angular velocity (K, 3) in S."""
         q = splines.quaternion(self.t)
         n = np.sum(q * q, axis=1, keepdims=True)
         acceleration = rates = None
@@ -64,7 +64,7 @@ class ImuSplineRows:
         return replace(self, acceleration_W=acceleration, quaternion_rate=rates)
 
     def pose_noise_shares_left_by_imu(self, frequency: Array) -> tuple[Array, Array]:
-        """Return the shares (K,) of position and rotation noise that an IMU leaves, Eq. (T83)."""
+        """Return shares (K,) of position and rotation noise that remain with an IMU, (T83)."""
         w = 2.0 * np.pi * frequency
         data = self.acceleration_W, self.quaternion_rate
         ratios = zip(self.pose_noise_powers, self.imu_noise_powers, data, strict=True)
@@ -76,8 +76,8 @@ class PoseSplines:
     """Least-squares splines of poses of a frame P, with knots every `spacing` [s].
 
     Args:
-        smooth: penalize the fifth derivative with the likeliest weight, Eq. (T84), and limit
-            derivatives at the ends to the statistics of those inside.
+        smooth: penalize the fifth derivative with the likeliest weight, Eq. (T84), and
+            derivatives at the ends that exceed usual ones.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class PoseSplines:
         for part in (slice(0, 3), slice(3, 7)):
 
             def fit_part(ln_cutoff_hz: float, part: slice = part) -> tuple[Array, float, float]:
-                """Fit pose columns; return normal matrix, noise variance and -2 log likelihood."""
+                """Fit columns `part`; return normal matrix, noise variance, -2 ln likelihood."""
                 weight = self.rate / (2 * np.pi * np.exp(ln_cutoff_hz)) ** (2 * SPLINE_DEGREE)
                 band = gram + weight * penalty
                 factor = cholesky_banded(band)
@@ -286,7 +286,7 @@ def _split_rows_into_blocks(num_rows: int) -> list[slice]:
 def _spline_normal_equations(
     samples: Iterable[tuple[Array, Array]], knots: Array, degree: int, width: int
 ) -> tuple[Array, Array]:
-    """Return the normal equations of a spline: band (degree + 1, n) and right side (n, width)."""
+    """Return a spline's normal equations: banded matrix (degree + 1, n), right side (n, width)."""
     size, order = len(knots) - degree - 1, degree + 1
     band, right = np.zeros((order, size)), np.zeros((size, width))
     for t, x in samples:

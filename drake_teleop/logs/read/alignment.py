@@ -56,7 +56,7 @@ def resample(t_new: Array, t: Array, x: Array) -> Array:
 
 
 def low_pass(x: Array, dt: float, cutoff_hz: float | None) -> Array:
-    """Filter samples x (N, ...) without phase shift, Eq. (T10); no filter for a cut-off None."""
+    """Filter samples x (N, ...) without phase shift, Eq. (T10); return x for a cut-off None."""
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         return x
     n = len(x)
@@ -76,7 +76,7 @@ def low_pass(x: Array, dt: float, cutoff_hz: float | None) -> Array:
 
 
 def _pad_by_continuation(x: Array, pad: int, length: int) -> Array:
-    """Return rows x (k, N), extended by odd reflections of `pad` samples and filled to `length`."""
+    """Return rows x (k, N) with `pad` odd-reflected samples at both ends, filled to `length`."""
     n, end = x.shape[1], x.shape[1] + 2 * pad
     padded = np.empty((len(x), length))
     padded[:, pad : pad + n] = x
@@ -124,7 +124,7 @@ def noise_gain_of_derivatives(dt: float, bandwidth_hz: float | None) -> Array:
 
 
 def polynomial_fit_weights(n: int, dt: float, bandwidth_hz: float | None) -> Array:
-    """Return the matrix (6, w) from w samples, at most max(n, 9), to polynomial coefficients."""
+    """Return weights (6, w) of w samples in six polynomial coefficients; w <= max(n, 9)."""
     window = 0.0 if bandwidth_hz is None else SMOOTHER_WINDOW_OVER_PERIOD / bandwidth_hz
     half = max(_MIN_SMOOTHER_WINDOW_SAMPLES // 2, min(round(window / (2 * dt)), (n - 1) // 2))
     powers = np.vander(np.arange(-half, half + 1) / half, _SMOOTHER_DEGREE + 1, increasing=True)
@@ -196,7 +196,7 @@ def is_far_from_gaps(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
 
 
 def is_near_ends(log: Log, length_s: float, cutoff_hz: float | None) -> NDArray[np.bool_]:
-    """Return (N,) True within `length_s` [s] or a low-pass period of an end (a quarter at most)."""
+    """Return (N,) True within `length_s` [s] or a low-pass period, at most N / 4, of an end."""
     out = np.zeros(len(log), bool)
     if log.static:
         return out

@@ -103,7 +103,7 @@ def read_mat(path: Path) -> dict[str, NDArray]:
             if isinstance(value, np.ndarray):
                 _add_mat_array_unless_scalar(name, value, found)
     if not found:
-        raise ValueError("it has no arrays of numbers; save tables and timeseries as arrays")
+        raise ValueError("the file has no arrays of numbers; save tables and timeseries as arrays")
     return found
 
 

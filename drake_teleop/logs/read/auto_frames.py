@@ -20,11 +20,11 @@ from drake_teleop.logs.read.description_fields import STANDARD_GRAVITY
 from drake_teleop.logs.read.mounting import LeverArm, Mounting, find_mounting, lever_arm_from_wrench
 
 MIN_WARNED_IMU_LAG_S = 0.05
-ReadLog = Callable[[Description], Log]
+LogReader = Callable[[Description], Log]
 Estimate = tuple[Description, tuple[str, ...]]  # description with estimates, and notes
 
 
-def estimate_auto_imu_mounting(description: Description, source: str, read: ReadLog) -> Estimate:
+def estimate_auto_imu_mounting(description: Description, source: str, read: LogReader) -> Estimate:
     """Return the description with estimates for `auto` in the IMU's mounting, and notes."""
     imu = description.imu
     assert imu is not None
@@ -71,7 +71,7 @@ def _require_imu_rotation(mounting: Mounting | None, where: str) -> Mounting:
     else:
         return mounting
     what = f"the data do not determine the rotation of the IMU: {problem}"
-    raise DrakeTeleopError(what, where=where, remedy=f"{remedy}, or give a rotation matrix")
+    raise DrakeTeleopError(what, where=where, remedy=f"{remedy}, or set imu.frame")
 
 
 def _format_unexplained_shares(found: Mounting) -> str:
@@ -98,9 +98,9 @@ def _lever_arm_from_pose_or_wrench(mounting: Mounting | None, log_Io: Log, where
     lever = None
     if mounting is not None and mounting.fits_pose:
         lever = mounting.lever_arm
-    if lever is None or not lever.is_determined_by_axis.all():
+    if lever is None or not lever.are_axes_determined.all():
         arms = [arm for arm in (lever, lever_arm_from_wrench(log_Io)) if arm is not None]
-        lever = max(arms, key=lambda arm: int(arm.is_determined_by_axis.sum()), default=None)
+        lever = max(arms, key=lambda arm: int(arm.are_axes_determined.sum()), default=None)
     if lever is None:
         what = (
             "pose and wrench do not determine the position of the accelerometer: the pose has no"
@@ -108,8 +108,8 @@ def _lever_arm_from_pose_or_wrench(mounting: Mounting | None, log_Io: Log, where
         )
         remedy = "give imu.position in metres, or pose.position"
         raise DrakeTeleopError(what, where=where, remedy=remedy)
-    if not lever.is_determined_by_axis.all():
-        what = f"the motion does not determine {_unknown_axes(lever.is_determined_by_axis)} of the"
+    if not lever.are_axes_determined.all():
+        what = f"the motion does not determine {_unknown_axes(lever.are_axes_determined)} of the"
         what += f" accelerometer's position ({_format_arm_mm(lever)} mm, from the {lever.source})"
         remedy = "turn faster, about more axes, or give imu.position in metres"
         raise DrakeTeleopError(what, where=where, remedy=remedy)
@@ -132,7 +132,7 @@ def _format_arm_mm(lever: LeverArm) -> str:
     )
 
 
-def estimate_auto_pose_frame(description: Description, source: str, read: ReadLog) -> Estimate:
+def estimate_auto_pose_frame(description: Description, source: str, read: LogReader) -> Estimate:
     """Return the description with estimates for `auto` in the pose frame, and notes."""
     from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
 
@@ -181,7 +181,7 @@ def block_means_of_log(log: Log) -> BlockMeans:
 
 
 def _clock_rate_extension_name(log: Log) -> str | None:
-    """Return the name of the model extension for a wrong clock rate; None if it is unknown."""
+    """Return the name of the model extension for a wrong clock rate; None: not fitted."""
     if log.described is None or log.has_calendar_time or log.is_acceleration_unknown:
         return None
     imu = log.described.imu
@@ -211,17 +211,17 @@ def restore_removed_weight(log: Log, weight: Array, motion_log: Log) -> Log:
 _MAX_GRAVITY_DIRECTION_STD_DEG = 2.0
 
 
-def estimate_auto_gravity(description: Description, source: str, read: ReadLog) -> Estimate:
+def estimate_auto_gravity(description: Description, source: str, read: LogReader) -> Estimate:
     """Return the description with an estimate for `gravity: auto`, and notes."""
     start = description.model_copy(update={"gravity": tuple(description.gravity_W.tolist())})
     log, deviation = read(start), np.inf
 
-    def block_means_without_delay(delay_s: float) -> BlockMeans:
+    def block_means_at_delay(delay_s: float) -> BlockMeans:
         return block_means_of_log(remove_delay(log, delay_s))
 
-    explanation = explain_misfit(block_means_of_log(log), block_means_without_delay, ("gravity",))
+    explanation = explain_misfit(block_means_of_log(log), block_means_at_delay, ("gravity",))
     if explanation.theta[6] > 0.0:
-        change, covariance = explanation.state.parameters_of_extension("gravity")
+        change, covariance = explanation.fit.parameters_of_extension("gravity")
         estimated = description.gravity_W - change
         estimated *= STANDARD_GRAVITY / np.linalg.norm(estimated)
         deviation = direction_std_deg(estimated, covariance)

@@ -90,7 +90,7 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
         )
         blocks = _read_column_blocks(pairs, child_frame, f"{path}:{topic}")
     if not blocks:
-        raise DrakeTeleopError("has no messages", where=f"{path}:{topic}", remedy="record it again")
+        raise DrakeTeleopError("topic is empty", where=f"{path}:{topic}", remedy="record it again")
     columns = {
         name: np.concatenate([block[name] for block in blocks])
         for name, values in blocks[0].items()
@@ -146,7 +146,7 @@ def missing_topic_error(path: Path) -> DrakeTeleopError:
     remedy = (
         "describe it in a YAML file with `topic` in each stream; `drake-teleop inspect` drafts one"
     )
-    return DrakeTeleopError("is a bag, and no topic is specified", where=str(path), remedy=remedy)
+    return DrakeTeleopError("no topic of the bag is specified", where=str(path), remedy=remedy)
 
 
 @contextmanager

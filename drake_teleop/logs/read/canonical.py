@@ -58,7 +58,7 @@ class Log:
         gain_std: standard deviation of the sensor gains (relative).
         R_WS: (N, 3, 3) orientation of S in the world W.
         gravity_W: (3,) gravity in W [m/s^2].
-        one_sided_s: length of each end whose derivatives are one-sided [s].
+        one_sided_s: time at start and end with one-sided derivatives [s].
         described: the description, with estimates for `auto`.
         estimated: "gravity", "weight", if they are estimated from the data.
         resolution: quantization step of force and torque, for static poses [N, N m].
@@ -165,8 +165,8 @@ def write_log(log: Log, path: str | Path) -> None:
 def describe_canonical(path: Path, table: Table) -> Description:
     """Return the description of a canonical table (columns `t`, `f_x` ...).
 
-    Rows with orientation or specific force are static poses below 0.05 rad/s (median) if `t` is
-    absent, or slower than 5 Hz with tilts by more than 10 deg in a fifth of the steps.
+    Rows with orientation or specific force are static poses in two cases: without `t`, if the
+    median speed is below 0.05 rad/s; below 5 Hz, if a fifth of the steps tilt by over 10 deg.
     """
     if not {"t", *WRENCH_COLUMNS} & set(table.columns):
         what = "is not a canonical log: it has none of the columns t, f_x ... tau_z"

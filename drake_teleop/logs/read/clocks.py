@@ -85,7 +85,7 @@ def time_stamps_and_num_episodes(
     """Return the scaled times (N,) of a table's rows [s], NaN if absent, and number of episodes.
 
     `time.scale` and joining of episodes use the whole table: all its streams keep one clock. With
-    `time.rate`, rows without numbers of the stream are gaps, unless other streams fill them.
+    `time.rate`, rows without numbers in `columns` are gaps, except for rows of other streams.
     """
     if time.column is None:
         assert time.rate is not None
@@ -151,7 +151,7 @@ def join_episodes(t: Array) -> tuple[Array, int]:
     return result, len(back) + 1
 
 
-def zero_steps_between_episodes(steps: Array, median_step: float, num_episodes: int) -> Array:
+def set_episode_steps_to_zero(steps: Array, median_step: float, num_episodes: int) -> Array:
     error, inner = np.abs(steps - max(EPISODE_SPACING_S, 10.0 * median_step)), steps.copy()
     inner[np.argsort(error, kind="stable")[: num_episodes - 1]] = 0.0
     return inner
@@ -174,7 +174,7 @@ def find_gaps_in_times(t: Array, bandwidth_hz: float | None) -> Array:
 
 
 def min_gap_length_s(step: float, bandwidth_hz: float | None) -> float:
-    """Return the least length of a gap [s]: four steps, and half a period of the bandwidth."""
+    """Return the least length of a gap [s]: the larger of 4 steps and half a bandwidth period."""
     return max(MIN_GAP_STEPS * step, 0.0 if bandwidth_hz is None else 0.5 / bandwidth_hz)
 
 
@@ -219,7 +219,7 @@ def _check_stamps_go_forward(t: Array, rows: NDArray[np.intp], table: Table, whe
         raise DrakeTeleopError(what, where=where, remedy=remedy)
     if len(t) > 1 and t[0] == t[-1]:
         what = f"the time stamps of {table.path.name} never increase"
-        raise DrakeTeleopError(what, where=where, remedy="name another column, or give time.rate")
+        raise DrakeTeleopError(what, where=where, remedy="set time.column, or time.rate")
 
 
 def _check_sampling(t: Array, rows: NDArray[np.intp], time: Time, table: Table, where: str) -> None:

@@ -67,7 +67,7 @@ class Orientation(StrictModel):
         description="axes of the Euler angles, in the order of the columns: small letters for"
         " fixed axes, such as xyz (roll, pitch, yaw), capitals for moving ones, such as ZYX",
     )
-    inverse: bool = Field(default=False, description="true if the columns hold R_SW")
+    inverse: bool = Field(default=False, description="true if the columns are the inverse, R_SW")
 
     @model_validator(mode="after")
     def _check_euler_axes(self) -> Orientation:
@@ -170,9 +170,9 @@ class Imu(_RecordedStreamDescription):
     sign: Literal[1, -1] = Field(
         default=1, description="sign of the specific force; -1 if the file has g - a"
     )
-    frame: fields.ImuFrame = Field(default="sensor", description="axes of the IMU; auto: estimated")
+    frame: fields.ImuFrame = Field(default="sensor", description="IMU axes in S; auto: estimated")
     position: fields.PositionOrAuto = Field(
-        default=(0.0, 0.0, 0.0), description="p_SoIo_S of the accelerometer, m; auto: estimated"
+        default=(0.0, 0.0, 0.0), description="accelerometer from So, in S, m; auto: estimated"
     )
 
     @model_validator(mode="after")
@@ -181,7 +181,7 @@ class Imu(_RecordedStreamDescription):
             raise ValueError("an IMU has no signal: give specific_force, angular_velocity, or both")
         uses_force = self.is_mounting_auto or self.sign != 1 or any(self.position)
         if uses_force and not self.specific_force:
-            raise ValueError("sign, position and auto require specific_force: add or remove them")
+            raise ValueError("imu.sign, position and frame auto require specific_force: add it")
         return self
 
     @property
@@ -203,19 +203,19 @@ class Pose(_RecordedStreamDescription):
     )
     rotation_in_sensor: fields.RotationOrAuto = Field(
         default=None,
-        description="rotation R_SP from the posed frame to S, as in frame; auto: estimated",
+        description="rotation R_SP from the posed frame to S, instead of frame; auto: estimated",
     )
 
     @model_validator(mode="after")
     def _check_pose_frame(self) -> Pose:
         if self.frame == "base":
-            raise ValueError("frame must be sensor, or a rotation matrix from the posed frame to S")
+            raise ValueError("pose.frame must be the word sensor, or a rotation matrix from P to S")
         if self.frame != "sensor" and self.rotation_in_sensor is not None:
             raise ValueError("frame and rotation_in_sensor both give R_SP: give one of them")
         shifted = self.position_in_sensor == "auto" or any(self.position_in_sensor)
         if self.position is None and (shifted or self.rotation_in_sensor == "auto"):
             raise ValueError(
-                "position_in_sensor and auto require positions: give pose.position, or remove them"
+                "position_in_sensor and auto require pose.position: add it, or remove these fields"
             )
         return self
 
@@ -271,8 +271,8 @@ class Description(StrictModel):
     @model_validator(mode="after")
     def _check_stream_combination(self) -> Description:
         if not 0.0 < (largest := np.abs(self.gravity_W).max()) <= _MAX_GRAVITY_M_S2:
-            rule = f"more than 0, at most {_MAX_GRAVITY_M_S2:g} m/s^2"
-            raise ValueError(f"the largest component of gravity is {largest:g} ({rule})")
+            rule = f"more than 0, at most {_MAX_GRAVITY_M_S2:g}"
+            raise ValueError(f"the largest component of gravity is {largest:g} m/s^2 ({rule})")
         if self.gravity == "auto" and (self.pose is None or self.imu is not None):
             raise ValueError("gravity: auto requires a wrench and a pose alone: give the vector")
         if self.static is not None:
@@ -306,7 +306,6 @@ class Description(StrictModel):
 
     @property
     def streams(self) -> dict[str, Any]:
-        """Described streams by name: some of wrench, imu, pose and static."""
         names = ("wrench", "imu", "pose", "static")
         return {name: x for name in names if (x := getattr(self, name)) is not None}
 
@@ -329,7 +328,7 @@ def load_description(path: str | Path) -> Description:
     data = read_yaml(path)
     if not isinstance(data, dict):
         remedy = "see docs/log-description.md"
-        raise DrakeTeleopError("contains no fields", where=str(path), remedy=remedy)
+        raise DrakeTeleopError("YAML file contains no fields", where=str(path), remedy=remedy)
     try:
         description = Description.model_validate(data)
     except ValidationError as error:

@@ -49,8 +49,8 @@ def _parse_frame(value: Any, *, keywords: tuple[str, ...] = ("sensor", "base")) 
     except (TypeError, ValueError):
         matrix = np.empty(0)
     if matrix.shape != (3, 3) or matrix.dtype.kind not in "fi":
-        allowed = f"a 3x3 rotation matrix from the stream to S, or the word {' or '.join(keywords)}"
-        raise ValueError(f"must be {allowed}")
+        words = " or ".join(keywords)
+        raise ValueError(f"must be a 3x3 rotation matrix from the stream to S, or the word {words}")
     if not (np.abs(matrix) < 2.0).all() or orthogonality_error(matrix) > ROTATION_TOLERANCE:
         raise ValueError("is not a rotation: rows must be orthonormal with determinant +1")
     return tuple(map(tuple, nearest_rotation(matrix).tolist()))
@@ -74,14 +74,14 @@ def _parse_gravity(value: Any) -> Any:
     if isinstance(value, str) and value != "auto":
         raise ValueError("gravity must be a number, three numbers [m/s^2], or the word auto")
     if _is_number(value) and value < 0.0:
-        raise ValueError(f"gravity has the magnitude {value:g}: remove the sign, or give a vector")
+        raise ValueError(f"gravity is {value:g}, but has no sign: remove it, or give a vector")
     return [0.0, 0.0, -float(value)] if _is_number(value) else value
 
 
 def _parse_scale_factors(value: Any) -> Any:
     factors = value if isinstance(value, (list, tuple)) else [value]
     if any(_is_number(x) and abs(x) < _MIN_SCALE_FACTOR for x in factors):
-        raise ValueError(f"factors must have absolute values of at least {_MIN_SCALE_FACTOR:g}")
+        raise ValueError(f"a scale factor is below {_MIN_SCALE_FACTOR:g} in magnitude")
     return [float(value)] * 3 if _is_number(value) else value
 
 

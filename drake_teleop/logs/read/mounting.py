@@ -24,20 +24,20 @@ SignalPairs = list[tuple[Array, Array]]
 
 
 def signal_pairs_of_pose_and_imu(t: Array, imu: Log, pose: Log, gyroscope: bool) -> SignalPairs:
-    """Return pairs of specific force (and omega if `gyroscope`): of pose at `t`, IMU at `imu.t`."""
+    """Return (pose signal at `t`, IMU signal) of specific force, and of omega if `gyroscope`."""
     signals = list(zip(pose.motion, imu.motion, strict=True))[: 1 + gyroscope]
     return [(resample(t, pose.t, x), y) for x, y in signals]
 
 
 def lag_of_imu_clock(
-    t: Array, pairs: SignalPairs, t_imu: Array, max_lag_s: float, arm_effects: Array
+    t: Array, pairs: SignalPairs, t_imu: Array, max_lag_s: float, lever_effects: Array
 ) -> float:
     """Return the lag of the IMU's clock [s], within +-`max_lag_s`, with the best fit to the pose.
 
-    The axes of the IMU may differ by any affine map. Components along `arm_effects` (N, k),
-    accelerations by a lever arm, are removed.
+    The axes of the IMU may differ by any affine map. Components along `lever_effects` (N, k),
+    accelerations due to a lever arm, are removed.
     """
-    U, singular, _ = np.linalg.svd(arm_effects - arm_effects.mean(axis=0), full_matrices=False)
+    U, singular, _ = np.linalg.svd(lever_effects - lever_effects.mean(axis=0), full_matrices=False)
     U = U[:, singular > 1e-3 * singular[0]]
 
     def remove_arm_effects(x: Array) -> Array:
@@ -145,7 +145,7 @@ def jackknife_deviations(jacobian: Array, residual: Array, width: int) -> Array:
 
 
 MAX_LEVER_ARM_DEVIATION_M = 0.005  # of a determined coordinate
-MAX_UNEXPLAINED_SHARE = 0.05  # of the variance, for a valid fit
+MAX_UNEXPLAINED_IMU_SHARE = 0.05  # of the variance, for a valid fit
 IMU_COMPARISON_CUTOFF_HZ, NUM_COMPARED_SAMPLES = 8.0, 1500
 # Least signal-to-noise power ratio of the motion; the lever arm is at most 5 % too short.
 _MIN_MOTION_OVER_NOISE_POWER = 20.0
@@ -153,7 +153,7 @@ _MIN_MOTION_OVER_NOISE_POWER = 20.0
 
 @dataclass(frozen=True)
 class LeverArm:
-    """Estimated position of the accelerometer.
+    """Estimated position of the accelerometer, as a correction.
 
     Attributes:
         p_SoIo_S: (3,) position minus `imu.position` of the log description, in S [m].
@@ -166,7 +166,7 @@ class LeverArm:
     source: str
 
     @property
-    def is_determined_by_axis(self) -> NDArray[np.bool_]:
+    def are_axes_determined(self) -> NDArray[np.bool_]:
         return self.deviations < MAX_LEVER_ARM_DEVIATION_M
 
 
@@ -196,7 +196,7 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     start = np.concatenate([np.zeros(4), offsets, phi])
     x, deviations = least_squares_with_deviations(residual_at, start)
     left, whole = (y.var(axis=0).reshape(2, 3).sum(axis=1) for y in (residual_at(x), wrench))
-    if (left > MAX_UNEXPLAINED_SHARE * whole).any():
+    if (left > MAX_UNEXPLAINED_IMU_SHARE * whole).any():
         return None
     observable = are_lever_arm_axes_observable(lever_matrix(*motion[1:]), smooth, cutoff)
     return LeverArm(x[:3], np.where(observable, deviations[:3], np.inf), "wrench")
@@ -217,7 +217,7 @@ def lever_matrix(omega: Array, alpha: Array) -> Array:
 
 
 def are_lever_arm_axes_observable(K: Array, log: Log, cutoff: float) -> NDArray[np.bool_]:
-    """Return (3,) True for axes along which the motion K determines a lever arm."""
+    """Return (3,) True for axes along which accelerations K (N, 3, 3) determine a lever arm."""
     alpha = log.angular_acceleration
     wide, narrow = (alignment.low_pass(alpha, log.dt, x) for x in (2 * cutoff, cutoff))
     noise = (wide - narrow).var(axis=0) / 7
@@ -285,10 +285,10 @@ class Mounting:
     def fits_pose(self) -> bool:
         """Whether IMU and pose agree, with small unexplained shares."""
         omega = self.unexplained_omega
-        if self.is_mirrored or (omega is not None and omega >= MAX_UNEXPLAINED_SHARE):
+        if self.is_mirrored or (omega is not None and omega >= MAX_UNEXPLAINED_IMU_SHARE):
             return False
         if self.lever_arm is not None:
-            return self.unexplained < MAX_UNEXPLAINED_SHARE
+            return self.unexplained < MAX_UNEXPLAINED_IMU_SHARE
         # Without positions the pose determines the angular velocity, but not the acceleration.
         return omega is not None or self.unexplained < MAX_UNEXPLAINED_SHARE_WITHOUT_POSITIONS
 

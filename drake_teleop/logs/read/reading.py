@@ -1,4 +1,4 @@
-"""Conversion of a canonical table or a described recording into a `Log` (long: one class)."""
+"""Conversion of a canonical table or a described recording into a `Log`."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from drake_teleop.logs.read.tables import Table, decimal_resolution
 MIN_STATIC_POSES, MIN_CUTOFF_HZ = 3, 1e-3
 _CONVERTED_CHUNK_ROWS, _MIN_IMU_GAP_OVER_STEP = 2**16, 4.0
 _MIN_CALENDAR_TIME_S, _MAX_CALENDAR_TIME_S = 1e8, 1e10  # years 1973 and 2286
-_EstimateAuto = Callable[..., auto_frames.Estimate]
+_AutoEstimator = Callable[..., auto_frames.Estimate]
 
 
 def read_log(
@@ -72,11 +72,11 @@ def read_log(
     raise DrakeTeleopError(f"format {path.suffix!r} is not known", where=str(path), remedy=remedy)
 
 
-def check_path_and_cutoff(path: Any, cutoff_hz: Any, name: str = "cutoff_hz") -> None:
+def check_path_and_cutoff(path: Any, cutoff_hz: Any, option: str = "cutoff_hz") -> None:
     expect_type((str, Path), path, "log", "give the file's name")
-    if cutoff_hz is not None and not to_float(name, cutoff_hz) >= MIN_CUTOFF_HZ:
+    if cutoff_hz is not None and not to_float(option, cutoff_hz) >= MIN_CUTOFF_HZ:
         remedy = f"give at least {MIN_CUTOFF_HZ:g} Hz, or None for no limit"
-        raise DrakeTeleopError(f"{cutoff_hz:g} Hz is too low", where=name, remedy=remedy)
+        raise DrakeTeleopError(f"cut-off {cutoff_hz:g} Hz is too low", where=option, remedy=remedy)
 
 
 def read_described_log(
@@ -137,7 +137,7 @@ class _LogReader:
         other = self.description.model_copy(update={"wrench": without})
         return restore_removed_weight(log, np.array(weight), self._read_described_log(other))
 
-    def _replace_auto_fields(self, estimate: _EstimateAuto, *, differentiate: bool = True) -> None:
+    def _replace_auto_fields(self, estimate: _AutoEstimator, *, differentiate: bool = True) -> None:
         read = partial(self._read_described_log, differentiate=differentiate)
         self.description, notes = estimate(self.description, self.source, read)
         self.notes += notes
@@ -322,7 +322,7 @@ class _LogReader:
             )
         step, found_gaps = np.median(np.diff(t)), clocks.find_gaps_in_times(t, self.bandwidth_hz)
         lengths = found_gaps[:, 1] - found_gaps[:, 0]
-        lengths = clocks.zero_steps_between_episodes(lengths, step, clock.num_episodes)
+        lengths = clocks.set_episode_steps_to_zero(lengths, step, clock.num_episodes)
         if clock.num_episodes > 1:
             starts = f"the clock starts {clock.num_episodes} times"
             if len({stream.source for stream in self.description.streams.values()}) > 1:
@@ -331,7 +331,7 @@ class _LogReader:
                 raise DrakeTeleopError(what, where=f"{self.source}:{name}.time", remedy=remedy)
             if name == "wrench":
                 self.notes.append(
-                    f"{starts}: the episodes follow each other, 1 s or more apart; samples near"
+                    f"{starts}: episodes are joined 1 s or more apart; samples near"
                     " their ends are not used"
                 )
         if lengths.any():

@@ -81,7 +81,7 @@ def rotate_world_to_S(R_WS: Array, vectors_W: Array) -> Array:
 
 
 def rotate_wrench_world_to_S(R_SW: Array, wrench_W: Array) -> Array:
-    """Rotate wrenches (N, 6) from the axes of W to those of S, about the same point."""
+    """Rotate wrenches (N, 6) from axes of W to S; the reference point is unchanged."""
     return np.einsum("nij,nkj->nki", R_SW, wrench_W.reshape(-1, 2, 3)).reshape(-1, 6)
 
 
@@ -98,9 +98,9 @@ class OrientationColumns:
             self._columns *= description.unit_in_si(described.unit)
 
     def allocate_quaternions(self, count: int) -> Array:
-        """Return an array (count, 4) for quaternions, possibly in the memory of the columns.
+        """Return an array (count, 4) for quaternions that may share memory with the columns.
 
-        Write row k only after the columns are read up to row k.
+        Write row k only after reading row k of the columns.
         """
         return self._columns[:count] if self._columns.shape[1] == 4 else np.empty((count, 4))
 
@@ -108,7 +108,7 @@ class OrientationColumns:
         """Return R_WS or R_WP (n, 3, 3) of n rows; raise an error if these are no rotations."""
         orientation = self._orientation
         R = rotations.rotation_matrices(self._columns[rows], orientation.form, orientation.axes)
-        self._check_rotation_errors(rotations.orthogonality_error(R), rows)
+        self._check_orthogonality_errors(rotations.orthogonality_error(R), rows)
         return rotations.nearest_rotation(np.swapaxes(R, 1, 2) if orientation.inverse else R)
 
     def quaternions(self, rows: NDArray[np.intp]) -> Array:
@@ -119,13 +119,13 @@ class OrientationColumns:
         if self._orientation.form == "quaternion_xyzw":
             q = np.roll(q, 1, axis=1)
         squared = np.einsum("ij,ij->i", q, q)  # the matrix of q is this, times a rotation
-        self._check_rotation_errors(np.abs(squared**2 - 1.0), rows)
+        self._check_orthogonality_errors(np.abs(squared**2 - 1.0), rows)
         q /= np.sqrt(squared)[:, None]
         if self._orientation.inverse:
             q[:, 1:] *= -1.0
         return q
 
-    def _check_rotation_errors(self, errors: Array, rows: NDArray[np.intp]) -> None:
+    def _check_orthogonality_errors(self, errors: Array, rows: NDArray[np.intp]) -> None:
         worst = int(np.argmax(errors))
         if errors[worst] > ROTATION_TOLERANCE:
             row = self._table.line_in_file(rows[worst])

@@ -52,7 +52,7 @@ _MAX_CELLS_IN_MEMORY = 2**24  # of a Parquet file; columns of larger ones are re
 
 
 def note_that_table_needs_description(source: str) -> str:
-    """Return a remark that fields of a table need a log description; "" for other files."""
+    """Return a remark that fields of a table require a log description; "" for a description."""
     if Path(source).suffix.lower() not in TABLE_READERS:
         return ""
     return " (in a log description of this table; the canonical form has no such line)"
@@ -63,7 +63,7 @@ def read_table(path: Path, *, header: bool = True) -> Table:
     kind = TABLE_READERS.check(path.suffix.lower(), str(path))
     require_file(path, folder=kind == ".zarr")
     errors.refuse_polars_in_forked_process()
-    with errors.wrap_read_errors(path, f"check that it is a valid {path.suffix} file"):
+    with errors.wrap_read_errors(path, f"check that the file is a valid {path.suffix} file"):
         columns = _read_text(path, header) if kind in _TEXT_SUFFIXES else TABLE_READERS[kind](path)
         table = columns if isinstance(columns, Table) else Table(path, columns)
     if not table.columns or not all(len(c) for c in table.columns.values()):
@@ -378,7 +378,7 @@ def array_columns(
 
 def _read_npz(path: Path) -> dict[str, NDArray]:
     if not zipfile.is_zipfile(path):
-        raise ValueError("it is not a complete NPZ archive; numpy.savez writes one")
+        raise ValueError("the file is not a complete NPZ archive; numpy.savez writes one")
     with np.load(path, allow_pickle=False) as archive:
         columns = {key: archive[key] for key in archive.files}
     return {key: x for key, x in columns.items() if isinstance(x, np.ndarray) and x.ndim}
@@ -389,7 +389,7 @@ def _read_npy(path: Path) -> dict[str, NDArray]:
     if array.dtype.names is not None:
         return {name: array[name] for name in array.dtype.names}
     if array.ndim != 2:
-        raise ValueError(f"its array has {array.ndim} dimensions; save one of rows and columns")
+        raise ValueError(f"the array has {array.ndim} dimensions; save one of rows and columns")
     return {str(k): array[:, k] for k in range(array.shape[1])}
 
 
@@ -403,7 +403,7 @@ def _table_reader_of_arrays(read: _ArrayReader) -> _ArrayReader:
 
 
 def _with_samples_as_rows(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
-    """Move the last axis of arrays (k, ..., N > k) to the front if 1-D arrays have length N."""
+    """Move the last axis of arrays (k, ..., N > k) first if the file's 1-D arrays have length N."""
     lengths = {len(array) for array in arrays.values() if array.ndim == 1}
 
     def is_transposed(array: NDArray) -> bool:

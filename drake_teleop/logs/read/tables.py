@@ -28,7 +28,7 @@ class Table:
     Attributes:
         columns: arrays (N,) by name; of arrays (N, ...) also the elements, `name[0]` (row-major).
         first_row: number of the first data row in the file.
-        absent_groups: names of column groups that the file marks as not provided.
+        absent_groups: column groups, such as torque, that the file marks as not provided.
         whole_table: table of all rows, if this one has only some of them.
         kept_rows: row numbers in `whole_table`, counted from 0; None: all rows.
         note: which part of the file was read, if it has several.
@@ -43,7 +43,7 @@ class Table:
     note: str = ""
 
     def line_in_file(self, row: int) -> int:
-        """Return the number in the file, for messages, of a row of this table."""
+        """Return the line number of a row in the file."""
         return self.first_row + int(row if self.kept_rows is None else self.kept_rows[row])
 
     def rows_with_any_number(self, names: Sequence[str | int]) -> Table:
@@ -74,7 +74,7 @@ class Table:
     def finite_numbers(
         self, names: Sequence[str | int], width: int, where: str, rows: int | None = None
     ) -> Array:
-        """Return the finite numbers (N, width) of the named columns; raise an error for others."""
+        """Return the numbers (N, width) of the named columns; raise an error for NaN, infinity."""
         out, found = np.empty((0, width)), 0
         for name in names:  # one after the other, to save memory
             column = self._finite_column(str(name), where)
@@ -102,7 +102,7 @@ class Table:
         return np.hstack(columns)
 
     def numbers_with_nan(self, name: str | int, where: str) -> Array:
-        """Return the numbers (N, k) of a column, with NaN and infinity; errors name `where`."""
+        """Return the numbers (N, k) of a column, with NaN and infinity; `where` is for errors."""
         name = str(name)
         if name not in self.columns:
             return self._finite_column(name, where)
@@ -118,7 +118,7 @@ class Table:
         if numbers.shape[1] != 1:
             column = f"{str(name)!r} of {self.path.name}"
             what = f"{column} has {numbers.shape[1]} numbers per row, not 1"
-            raise DrakeTeleopError(what, where=where, remedy="name a column with 1 number per row")
+            raise DrakeTeleopError(what, where=where, remedy="set a column with 1 number per row")
         return numbers[:, 0]
 
     def check_magnitude(

@@ -20,26 +20,25 @@ TimeSpans = tuple[tuple[float, float], ...]  # (start, stop) of contacts [s]
 
 @dataclass(frozen=True, eq=False)
 class UsedRows:
-    """Rows of a record (`used` (M,) True) and signal columns to which a model is fitted."""
+    """Rows of a record (flags `used` (M,)) and signal columns to which a model is fitted."""
 
-    data: BlockMeans
+    means: BlockMeans
     used: NDArray[np.bool_]
     step_times: tuple[float, ...]
     columns: NDArray[np.intp]
 
     @cached_property
     def y(self) -> Array:
-        zeroed = self.data.with_other_rows_zeroed(self.used)
+        zeroed = self.means.with_only_used_rows(self.used)
         return zeroed.append_step_signals(self.step_times)[:, self.columns]
 
     @cached_property
     def lagged_product_sums(self) -> Array:
-        """Sums (5, W, W) of y_i y_(i-d)^T for lags d of 0 to 4 rows, plus transpose if d > 0."""
-        return np.asarray(self.data.lagged_block_sums(self.y, rows=len(self.y))[0])
+        """Sums (5, W, W) of products of W signals y_i y_(i-d)^T, lags d <= 4 rows; symmetrized."""
+        return np.asarray(self.means.lagged_block_sums(self.y, rows=len(self.y))[0])
 
     @cached_property
     def rows_with_four_predecessors(self) -> NDArray[np.intp]:
-        """Indices of used rows whose four predecessors are used, too."""
         padded = np.pad(self.used, (instants.AR_ORDER, 0))
         return np.flatnonzero(sliding_window_view(padded, instants.AR_ORDER + 1).all(axis=1))
 
@@ -53,7 +52,7 @@ class UsedRows:
         return np.asarray(y[at])
 
     def whitened_products(self, filters: Array) -> Array:
-        """Return sums of products (6, n, n) of n signals after whitening by the filters (6, 5)."""
+        """Return product sums (6, n, n) of n signals, whitened by each row of `filters` (6, 5)."""
         width = self.y.shape[1]
         taps = [(filters[:, : 5 - d] * filters[:, d:]).sum(axis=1) for d in range(5)]
         full = np.stack(taps, axis=1) @ self.lagged_product_sums.reshape(5, -1)
@@ -84,17 +83,17 @@ class UsedRows:
         return np.asarray(np.sqrt((e * e).sum(axis=0) / max(self.used.sum(), 1)))
 
 
-def is_in_time_spans(data: BlockMeans, spans: TimeSpans) -> NDArray[np.bool_]:
-    inside = [(data.t >= start) & (data.t <= stop) for start, stop in spans]
-    return np.any([np.zeros(len(data.t), bool), *inside], axis=0)
+def is_in_time_spans(means: BlockMeans, spans: TimeSpans) -> NDArray[np.bool_]:
+    inside = [(means.t >= start) & (means.t <= stop) for start, stop in spans]
+    return np.any([np.zeros(len(means.t), bool), *inside], axis=0)
 
 
 _MAX_FIT_ITERATIONS, _CONVERGED_MOVE_OVER_DEVIATION, _UNWEIGHTED_FIT_ITERATIONS = 12, 0.02, 2
 _RIDGE_OF_SCALED_GRAM, _MIN_NOISE_OVER_SIGNAL_POWER = 1e-11, 1e-14
 _NUM_TIME_SEGMENTS_OF_MISFIT_TEST = 6
 # (18, 27) from rotation-position products to the signals of a symmetric stiffness.
-_STIFFNESS_ENTRY_MASKS = [SYMMETRIC_MATRIX_INDICES.ravel() == k for k in (0, 3, 5, 1, 2, 4)]
-_PRODUCTS_TO_STIFFNESS = np.vstack([np.kron(np.eye(3), entry) for entry in _STIFFNESS_ENTRY_MASKS])
+_CABLE_ENTRY_MASKS = [SYMMETRIC_MATRIX_INDICES.ravel() == k for k in (0, 3, 5, 1, 2, 4)]
+_CABLE_STIFFNESS_MATRIX = np.vstack([np.kron(np.eye(3), entry) for entry in _CABLE_ENTRY_MASKS])
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +102,7 @@ class FittedModel:
 
     Attributes:
         covariance: (size, size); huge for undetermined parameters.
-        residual: (6, k) coefficients; their product with a row of `rows.y` is the residual wrench.
+        residual: (6, k) coefficients; their product with k signals of a row is the residual wrench.
         noise_filters: (6, 5) that whiten the residual e: sum over d of filter[c, d] e_c[n - d].
         noise_power: (6,) variance of the whitened residual.
         contact_spans: (start, stop) of contacts, whose rows are not used [s].
@@ -120,10 +119,11 @@ class FittedModel:
 
     @classmethod
     def fit_record(
-        cls, data: BlockMeans, model: LoadModel, start: Array | None = None, spans: TimeSpans = ()
+        cls, means: BlockMeans, model: LoadModel, start: Array | None = None, spans: TimeSpans = ()
     ) -> FittedModel:
-        used = data.used & ~is_in_time_spans(data, spans)
-        return fit_model(model, UsedRows(data, used, model.step_times, model.columns), start, spans)
+        free = means.used & ~is_in_time_spans(means, spans)
+        rows = UsedRows(means, free, model.step_times, model.columns)
+        return fit_model(model, rows, start, spans)
 
     def refit(self, model: LoadModel, start: Array | None = None, **options: int) -> FittedModel:
         if start is None:
@@ -135,11 +135,11 @@ class FittedModel:
         rows = self.rows
         if rows.step_times == model.step_times and np.array_equal(rows.columns, model.columns):
             return rows
-        return UsedRows(self.data, rows.used, model.step_times, model.columns)
+        return UsedRows(self.means, rows.used, model.step_times, model.columns)
 
     @property
-    def data(self) -> BlockMeans:
-        return self.rows.data
+    def means(self) -> BlockMeans:
+        return self.rows.means
 
     def parameters_of_extension(self, name: str) -> tuple[Array, Array]:
         """Return the parameters of a named extension of the model, and their covariance."""
@@ -149,7 +149,7 @@ class FittedModel:
     def normal_equations(self, model: LoadModel, x: Array) -> tuple[Array, Array]:
         """Return gram (size, size) and right side (size,) of the normal equations at x (size,)."""
         whitened = self.rows.whitened_products(self.noise_filters) / self.noise_power[:, None, None]
-        J = model.wrench_derivative(x).transpose(1, 0, 2)
+        J = model.wrench_jacobian(x).transpose(1, 0, 2)
         weighted = J @ whitened
         gram = (weighted @ J.transpose(0, 2, 1)).sum(axis=0)
         right = (weighted @ self.residual[:, :, None]).sum(axis=0)[:, 0]
@@ -162,36 +162,36 @@ class FittedModel:
         own = -0.5 * count * float(np.log(self.noise_power).sum())
         if not self.contact_spans:
             return own
-        inside = replace(self.rows, used=self.data.used & ~self.rows.used)
+        inside = replace(self.rows, used=self.means.used & ~self.rows.used)
         power = inside.noise_filters_and_power(self.residual, 1e-6 * self.noise_power)[1]
         # Rows at the edges of contacts count as noise of this power, too.
-        every = replace(self.rows, used=self.data.used)
+        every = replace(self.rows, used=self.means.used)
         others = len(every.rows_with_four_predecessors) - count
         return own - 0.5 * others * float(np.log(power).sum())
 
     @cached_property
     def residual_ratio(self) -> float:
         """RMS residual over white noise, in the channel where this ratio is largest."""
-        white = np.maximum(self.data.wrench_noise, 1e-12)
+        white = np.maximum(self.means.wrench_noise, 1e-12)
         return float(np.max(self.rows.residual_rms(self.residual) / white))
 
     @cached_property
     def smooth_misfit(self) -> float:
-        """`gain_by_smooth_signals` per added parameter; about 1 or less for noise alone."""
-        gain, freedom = self.gain_by_smooth_signals
+        """Likelihood gain of smooth signals per added parameter; about 1 or less for noise."""
+        gain, freedom = self.smooth_likelihood_gain
         return gain / max(1, freedom - self.model.size)
 
     @cached_property
-    def gain_by_smooth_signals(self) -> tuple[float, int]:
-        """Gain in twice the log likelihood by adding generic smooth signals, and their number."""
-        y = self.data.y
+    def smooth_likelihood_gain(self) -> tuple[float, int]:
+        """Gain in twice the log likelihood by generic smooth signals, and number of parameters."""
+        y = self.means.y
         segments = _NUM_TIME_SEGMENTS_OF_MISFIT_TEST
         part = np.linspace(0.0, segments, len(y), endpoint=False).astype(int)
         parts = [y[:, : instants.OMEGA_PRODUCTS.stop]]
-        if self.data.gravity_W is not None:
+        if self.means.gravity_W is not None:
             parts.append(y[:, instants.ROTATION_SIGNALS])
-        if self.data.has_positions:
-            parts.append(y[:, instants.ROTATION_POSITION_PRODUCTS] @ _PRODUCTS_TO_STIFFNESS.T)
+        if self.means.has_positions:
+            parts.append(y[:, instants.ROTATION_POSITION_PRODUCTS] @ _CABLE_STIFFNESS_MATRIX.T)
         columns = np.hstack([*parts, part[:, None] == np.arange(1.0, segments)])
         e = self.rows.y @ self.residual.T
         whole, filters = self.rows.rows_with_four_predecessors, self.noise_filters
@@ -223,7 +223,7 @@ def fit_model(
 ) -> FittedModel:
     x = np.zeros(model.size) if start is None else start
     count = max(float(rows.used.sum()), 1.0)
-    total = (rows.data.y[rows.used][:, instants.WRENCH_SIGNALS] ** 2).sum(axis=0) / count
+    total = (rows.means.y[rows.used][:, instants.WRENCH_SIGNALS] ** 2).sum(axis=0) / count
     both = total.reshape(2, 3).sum(axis=1).repeat(3)
     floor = np.maximum(_MIN_NOISE_OVER_SIGNAL_POWER * both, 1e-30)
     white = np.eye(1, instants.AR_ORDER + 1).repeat(6, axis=0)
@@ -256,7 +256,7 @@ def regularized_inverse(gram: Array) -> Array:
 
 
 def score_statistic(gram: Array, right: Array, min_diagonal: ArrayLike = 0.0) -> tuple[float, int]:
-    """Return right^T gram^-1 right, the gain in twice the log likelihood, and the rank of gram."""
+    """Return right^T gram^-1 right, the gain in twice the log likelihood, and rank of gram."""
     diagonal = np.diag(gram)
     used = diagonal > np.maximum(min_diagonal, 1e-12 * diagonal.max())
     if not used.any():
