@@ -87,7 +87,7 @@ def eliminate_command(
 ) -> dict[str, Any]:
     """Remove the load's wrench from a log, write the contact wrench, return the summary.
 
-    `options` are other options of `eliminate_log`.
+    `offsets` is their source: "record" or "load".
     """
     load_file = Identification.load(load)
     tare = offsets == "record"
@@ -112,9 +112,9 @@ def eliminate_command(
     if found.detection is not None:
         summary["notes"] += found.detection.notes
     elif not found.log.static:
-        few = f"{len(found.log)} samples are too few to separate contact from noise"
+        few = f"contact flags are all False: {len(found.log)} samples are too few"
         required = f"record at least {MIN_NOISE_FLOOR_SAMPLES} besides both ends"
-        summary["notes"].append(f"contact flags are all False: {few}; {required}")
+        summary["notes"].append(f"{few} to separate contact from noise; {required}")
     summary = files.to_json_data(
         summary
         | summaries.summarize_wrenches(found)
@@ -216,14 +216,14 @@ def print_identification(summary: dict[str, Any], out: Path) -> None:
     headings = ("", "value", "std", "unit")
     table = _make_empty_table("Load identified from", summary, headings, left_aligned=("", "unit"))
     offsets, deviations, units = summary["offsets"], summary["offsets_std"], ["N", "N m"]
-    rows = _load_parameter_rows(summary) + [
+    rows = _make_parameter_rows(summary) + [
         (name, offsets[i], deviations[i], 1.0, units[i // 3], name)
         for i, name in enumerate(PARAMETER_NAMES[:6])
     ]
     _add_parameter_rows(table, rows, summary["identifiable"])
     if "object" in summary:
         table.add_section()
-        rows = [(f"object: {row[0]}", *row[1:]) for row in _load_parameter_rows(summary["object"])]
+        rows = [(f"object: {row[0]}", *row[1:]) for row in _make_parameter_rows(summary["object"])]
         _add_parameter_rows(table, rows, summary["object"]["identifiable"])
     figures = (
         "com from, and inertia about, the origin So of the sensor frame S\n"
@@ -240,7 +240,7 @@ _ParameterRow: TypeAlias = tuple[str, float, float, float, str, str]
 """Table row: label, value, standard deviation, factor from SI to the unit, unit, parameter."""
 
 
-def _load_parameter_rows(load: dict[str, Any]) -> list[_ParameterRow]:
+def _make_parameter_rows(load: dict[str, Any]) -> list[_ParameterRow]:
     rows: list[_ParameterRow] = [("mass", load["mass"], load["mass_std"], 1.0, "kg", "m")]
     rows += [
         (f"com {axis}", load["com"][i], load["com_std"][i], 1e3, "mm", f"m c_{axis}")

@@ -28,7 +28,7 @@ _OPEN_CLUTCH_TIME_S = 0.05
 
 
 class DeviceLink:
-    """UDP link to one device client on this machine; another may follow after 50 ms of silence.
+    """UDP link to one device client on this machine; 50 ms of silence admit another client.
 
     An address haply://HOST:PORT also starts the client.
 
@@ -115,7 +115,7 @@ class DeviceLink:
         self._origin, self._connected_at = self._state, now
 
     def hand_inputs(self, now: float) -> Mapping[str, float]:
-        """Return `Inputs` values for the device's motion from its origin; held = 0 if silent."""
+        """Return inputs x ... rz and held for the device's displacement; held = 0 if silent."""
         state = self.receive_state(now)
         if state is None or self._origin is None:
             return {"held": 0, "clutch": 0}
@@ -140,11 +140,11 @@ class DeviceLink:
 
     def status_text(self) -> str:
         if not self.refused:
-            return self._describe_link()
+            return self._connection_text()
         reason = f"the last one {self.refusal}"
-        return f"{self._describe_link()}. Refused packets: {self.refused}; {reason}"
+        return f"{self._connection_text()}. Refused packets: {self.refused}; {reason}"
 
-    def _describe_link(self) -> str:
+    def _connection_text(self) -> str:
         if self.is_device_silent(self._polled_at):
             what = "The device is silent: no force" if self._peer else "No device yet"
             return f"{what} (udp://127.0.0.1:{self.port})"

@@ -20,7 +20,7 @@ from drake_teleop.logs.causal import filter_lag
 from drake_teleop.logs.processing import notes_on_undetermined_load
 from drake_teleop.robots.assembly import ReadingAssembler
 from drake_teleop.robots.changes import ZeroAndLoadMonitor
-from drake_teleop.robots.compensator import SCALE_NAMES, TARE_REST_S, Compensator
+from drake_teleop.robots.compensator import SCALE_NAMES, TARE_AVERAGING_S, Compensator
 from drake_teleop.robots.connections import is_file_address, open_sink, open_source
 from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.streams import CompensatedWrench, Sink, Source
@@ -62,7 +62,7 @@ def compensate_stream(
 ) -> Counter[str]:
     """Compensate readings until the source ends or Ctrl-C; return counts of wrenches and flags."""
     counts: Counter[str] = Counter(wrenches=0)
-    tare_count = np.inf if not tare else round(TARE_REST_S / source.dt)
+    tare_count = np.inf if not tare else round(TARE_AVERAGING_S / source.dt)
 
     def write_and_count(out: CompensatedWrench) -> None:
         sink.write(out)
@@ -116,7 +116,7 @@ def run_compensate_command(
         sensor_range: range of the sensor: force [N], torque [N m].
         free: log of free motion, for contact detection.
         control: UDP port that accepts the request `tare`.
-        attach: receives the function that makes compensators; returns the one in use.
+        attach: hook of the ROS 2 node: from the maker of compensators to the one in use.
         options: those of `Compensator.set_scales` and `open_source`.
     """
     found = Identification.load(load)

@@ -288,7 +288,7 @@ class Ros2Sink:
         from rclpy.qos import qos_profile_sensor_data as quality
 
         topic, domain = checked_topic_name(parsed, parsed.path), domain_of_address(parsed)
-        self._which = parsed.wrench_name()
+        self._which = parsed.requested_wrench_name()
         names = "DiagnosticArray", "DiagnosticStatus", "KeyValue"
         types = (WRENCH_STAMPED, *(f"diagnostic_msgs/msg/{name}" for name in names))
         classes = {kind.rpartition("/")[2]: message_class(kind, address) for kind in types}

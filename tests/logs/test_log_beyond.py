@@ -202,7 +202,7 @@ def test_scales_outside_0_to_100_are_refused(name, value, tmp_path):
     path = log_file(tmp_path)
     load = identify_log(path, delay=0.0).identification
     line = error_line(lambda: eliminate_log(path, load, **{name: value}))
-    assert line == f"{name}: {value:g} is outside 0 to 100; give a scale, such as 0 or 1"
+    assert line == f"{name}: {value:g} is outside 0 to 100; give a finite scale >= 0"
 
 
 @pytest.mark.parametrize("cutoff", [1e-300, np.nan])

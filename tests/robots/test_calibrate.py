@@ -417,7 +417,7 @@ def test_a_single_result_within_the_tolerance_is_not_known(tmp_path, monkeypatch
     path, out = tmp_path / "log.parquet", tmp_path / "out"
     evaluate(recorded(3.0, [0, 1, 2]), "mass 1 %", path)
     monkeypatch.setattr("drake_teleop.cli.calibrate.identify_command", lambda *_, **__: {})
-    monkeypatch.setattr("drake_teleop.robots.calibration.FIRST_RECORD_S", 9.0)
+    monkeypatch.setattr("drake_teleop.robots.calibration.MIN_EVALUATED_RECORD_S", 9.0)
     summary = calibrate_command(f"replay:{path}", out, until="mass 50 %", quiet=True)
     assert summary["half_widths_95"]["mass"] < 0.1 and summary["looks"] == 1
     assert summary["known"] == {"mass": False} and not summary["all_known"]

@@ -87,7 +87,7 @@ class Procedure:
         }
         self._contact_forces: list[float] = []
         for trial, row in zip(self.trials, self._rows, strict=False):
-            self._update_psi_and_contact_forces(trial, row)
+            self._update_psi_method_and_contact_forces(trial, row)
         self.phase, self.is_answer_right, self.is_repeated = CONSENT_PHASE, False, False
         self.prepared_intervals = 0
         self._prepare_trial()
@@ -111,7 +111,7 @@ class Procedure:
 
     @property
     def expected_contact_force(self) -> float:
-        """Median of the participant's contact forces [N]; without any, the task's `pressed`."""
+        """Median of the participant's contact forces [N]; before the first, the task's estimate."""
         task = self.task
         if self._contact_forces:
             return float(np.median(self._contact_forces))
@@ -179,14 +179,14 @@ class Procedure:
         )
         self.store.write_rows(self.participant, [*self._rows, row])
         self._rows.append(row)
-        self._update_psi_and_contact_forces(trial, row)
+        self._update_psi_method_and_contact_forces(trial, row)
         self.is_answer_right = bool(correct)
         if trial.practice:
             self.phase = FEEDBACK_PHASE
         else:
             self._start_next_trial()
 
-    def _update_psi_and_contact_forces(self, trial: PlannedTrial, row: TrialRow) -> None:
+    def _update_psi_method_and_contact_forces(self, trial: PlannedTrial, row: TrialRow) -> None:
         if (trial.task, trial.condition) not in self._psi:
             return
         if isinstance(self.experiment.tasks[trial.task], ContactDetection):
