@@ -24,12 +24,12 @@ from drake_teleop.load.online.recursive_tls import (
     MomentEstimator,
     add_outer_product,
     allocate_work_arrays,
-    discount_samples_and_recentre_prior,
+    discount_samples_and_set_prior_to_theta,
     eliminate_below_diagonal,
     nonzero_regressor_terms,
     solve_augmented_system_in_place,
     write_inverse_6x6,
-    write_products_vector,
+    write_moment_vector,
     write_residual_products,
     write_weighted_gram,
     write_weighted_right_side,
@@ -99,10 +99,10 @@ def riv_update(theta, memory, samples, noise_std, forgetting, information, index
     y, z = np.empty(19), np.empty(19)
     for n in range(len(samples)):
         if forgetting < 1.0:
-            discount_samples_and_recentre_prior(memory, theta, information, forgetting)
+            discount_samples_and_set_prior_to_theta(memory, theta, information, forgetting)
         wrench = samples[n, WRENCH_SLICE]
-        write_products_vector(wrench, samples[n, MOTION_SLICE], z)
-        write_products_vector(wrench, samples[n, INSTRUMENTS], y)
+        write_moment_vector(wrench, samples[n, MOTION_SLICE], z)
+        write_moment_vector(wrench, samples[n, INSTRUMENTS], y)
         add_outer_product(z, z, memory[:19])
         add_outer_product(y, z, memory[19:38])
         add_outer_product(y, y, memory[38:57])

@@ -50,7 +50,7 @@ def calibrate_command(
         with Live(console=console, auto_refresh=False) as live:
 
             def show_progress(evaluation: RecordEvaluation) -> None:
-                live.update(make_progress_table(evaluation, tolerance), refresh=True)
+                live.update(make_progress_display(evaluation, tolerance), refresh=True)
 
             evaluations = calibrate(
                 stream, recorder, path, tolerance, seconds=seconds, show=show_progress, **processing
@@ -80,7 +80,7 @@ def calibrate_command(
     return summary
 
 
-def make_progress_table(evaluation: RecordEvaluation, tolerance: tolerances.Tolerance) -> Group:
+def make_progress_display(evaluation: RecordEvaluation, tolerance: tolerances.Tolerance) -> Group:
     table = Table(title=f"{evaluation.record_length_s:.1f} s recorded", title_justify="left")
     table.add_column("")
     for heading in ("value", "+- (95 %)", "required", "unit"):

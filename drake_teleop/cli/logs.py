@@ -106,7 +106,7 @@ def eliminate_command(
     }
     if found.tare_fraction < 0.5:
         summary["notes"].append(
-            "less than half of the record agrees on the sensor's offsets: if the tool is in contact"
+            "less than half of the record has the same sensor offsets: if the tool is in contact"
             " most of the time, the contact wrench may have a constant error"
         )
     if found.detection is not None:

@@ -1,4 +1,4 @@
-"""Commands of `drake-teleop`, which import packages on demand."""
+"""Commands of `drake-teleop` (long: one file for all commands)."""
 
 from __future__ import annotations
 

@@ -123,6 +123,8 @@ class FiniteNumber(click.FloatRange):
 
 
 class IntegerInRange(click.IntRange):
+    """Parameter type of integers in a range."""
+
     name, _type_without_range, convert = "integer", click.INT, FiniteNumber.convert
 
 
@@ -136,8 +138,8 @@ def int_option(name: str, limits: tuple[int, int], **settings: Any) -> Any:
     return click.option(name, type=IntegerInRange(*limits), **settings)
 
 
-def choice_option(name: str, words: list[str], default: str) -> Any:
-    return click.option(name, type=click.Choice(words), default=default)
+def choice_option(name: str, choices: list[str], default: str) -> Any:
+    return click.option(name, type=click.Choice(choices), default=default)
 
 
 class DelayOrAuto(click.ParamType):

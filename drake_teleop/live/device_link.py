@@ -22,7 +22,7 @@ from drake_teleop.robots.udp import LOCALHOST, host_and_port, open_udp_receiver
 
 _CLIENT_EXIT_TIMEOUT_S = 2.0  # s
 _MAX_PACKETS_PER_POLL = 256  # packets per poll
-_NUM_PACKETS_OF_LINK_STATISTICS = 2000  # packets in the statistics of lateness
+_LINK_STATISTICS_PACKETS = 2000  # packets in the statistics of lateness
 # Duration of the open clutch after silence, while the hand moves to the device's pose [s].
 _OPEN_CLUTCH_TIME_S = 0.05
 
@@ -58,8 +58,8 @@ class DeviceLink:
         self._last_arrival, self._connected_at, self._polled_at = -np.inf, np.inf, 0.0
         self._origin: DeviceState | None = None
         # Arrival minus the device's time; the minimum is the clock offset.
-        self._latencies: deque[float] = deque(maxlen=_NUM_PACKETS_OF_LINK_STATISTICS)
-        self._force_ages: deque[float] = deque(maxlen=_NUM_PACKETS_OF_LINK_STATISTICS)
+        self._latencies: deque[float] = deque(maxlen=_LINK_STATISTICS_PACKETS)
+        self._force_ages: deque[float] = deque(maxlen=_LINK_STATISTICS_PACKETS)
         self._client: subprocess.Popen[bytes] | None = None
         if kind == "haply":
             station = f"udp://{LOCALHOST}:{self.port}"

@@ -188,10 +188,10 @@ def inputs_at_displacement(
     return values
 
 
-_CURRENT_VERSIONS = {"drake_teleop": __version__}
+_PROGRAM_VERSIONS = {"drake_teleop": __version__}
 
 
-def csv_header(versions: Mapping[str, str] = _CURRENT_VERSIONS) -> str:
+def csv_header(versions: Mapping[str, str] = _PROGRAM_VERSIONS) -> str:
     comment = ", ".join(f"{name} {version}" for name, version in versions.items())
     return f"# {comment}\n{','.join(_CSV_COLUMNS)}\n"
 
@@ -202,7 +202,7 @@ def csv_row(ms: int, inputs: Inputs) -> str:
 
 
 def read_inputs(
-    path: Path, versions: Mapping[str, str] = _CURRENT_VERSIONS
+    path: Path, versions: Mapping[str, str] = _PROGRAM_VERSIONS
 ) -> list[tuple[int, Inputs]]:
     """Return the recorded changes as (time [ms], inputs); the time of the last one is the end.
 

@@ -83,7 +83,7 @@ class SliceSchedule:
 
     @property
     def real_time_factor(self) -> float:
-        """Ratio of simulated to clock time of the last 400 slices; 0 before the second one."""
+        """Ratio of simulated to clock time of the last 400 slices; 0 before the second slice."""
         if len(self._starts) < 2 or self._starts[-1] <= self._starts[0]:
             return 0.0
         return (len(self._starts) - 1) * self._slice / (self._starts[-1] - self._starts[0])
@@ -95,7 +95,6 @@ class SliceSchedule:
 
 @contextmanager
 def without_garbage_collection() -> Iterator[None]:
-    """Disable Python's garbage collector, which would delay slices."""
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -170,7 +169,7 @@ class Live:
     def change_scene(
         self, scenario: Scenario, load: IdentifiedLoad | None, show: SceneFunction, now: float
     ) -> None:
-        """Complete the record and start a new session with the requested scene at `now` [s]."""
+        """Complete the record and start a session with the requested scene."""
         self._scenario, self._load, self._scene_part = scenario, load, show
         self.scene, self.requested_scene = self.requested_scene, ""
         self._restart_session(now)
@@ -272,7 +271,7 @@ class Live:
             self.pace.begin_slice(now)
             self._simulate_time_slice(now)
         now = clock()
-        self._resume_if_device_sends(now)
+        self._resume_simulation_if_device_sends(now)
         if self._driver is None and not self._asleep and now - self._idle_since >= _MAX_UNDRIVEN_S:
             self._asleep = True
             self._run_and_stop_session_on_failure(self._session.write_record_and_log)
@@ -285,7 +284,7 @@ class Live:
         self._last_frame_at, self._show_now = now, False
         return self.frame()
 
-    def _resume_if_device_sends(self, now: float) -> None:
+    def _resume_simulation_if_device_sends(self, now: float) -> None:
         if self._link is None or self._link.receive_state(now) is None:
             return
         self._idle_since = now

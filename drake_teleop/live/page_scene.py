@@ -61,7 +61,7 @@ class PageScene:
             if all(np.isfinite(values[-1]).all() for values in rows.values()):
                 self._report_scene_failure(error)
             return {}
-        return moves.rounded_changes()
+        return moves.rounded_poses_and_sizes()
 
     def _report_scene_failure(self, error: BaseException) -> None:
         self.failure = to_one_line(f"no 3D scene: {error}")
@@ -79,7 +79,7 @@ class _SceneChangeRecorder:
     def SetProperty(self, path: str, property: str, value: list[float], time: float) -> None:
         self._sizes[path] = [round(x, 4) for x in value]
 
-    def rounded_changes(self) -> dict[str, Any]:
+    def rounded_poses_and_sizes(self) -> dict[str, Any]:
         matrices = np.array([*self._poses.values()]).round(5)
         if not np.isfinite(matrices).all():
             return {}

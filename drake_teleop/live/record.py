@@ -80,7 +80,7 @@ class SessionRecord:
             self._file.flush()
 
     def close(self, ms: int, inputs: Inputs) -> None:
-        """Write the end time [ms] and close the files; remove an empty record."""
+        """Write the end time [ms] and close the files; remove a record of 0 ms."""
         if not ms:
             return self._remove_record_files()
         self.write(ms, inputs)

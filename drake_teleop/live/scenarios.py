@@ -100,12 +100,12 @@ def scenario_of_inputs(scenario: Scenario, load: IdentifiedLoad | None, inputs: 
         changes["slave__payload"] = dataclasses.replace(DEFAULT_GRIPPED_PAYLOAD, mass=mass)
     changed = replace(scenario, **changes)
     if inputs.object and load is not None and scenario.force_scaling.gripper_phi is None:
-        gripper = load.identification.phi - has_payload * _payload_phi(changed)
+        gripper = load.identification.phi - has_payload * _inertial_parameters_of_payload(changed)
         changed = replace(changed, force_scaling__gripper_phi=gripper.tolist())
     return changed
 
 
-def _payload_phi(scenario: Scenario) -> Array:
+def _inertial_parameters_of_payload(scenario: Scenario) -> Array:
     payload = NominalSlave(scenario.slave).arm.phi_load
     empty = replace(scenario, slave__payload=Payload(mass=0.0))
     return payload - NominalSlave(empty.slave).arm.phi_load

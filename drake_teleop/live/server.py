@@ -386,7 +386,7 @@ def run_drive_command(
 ) -> None:
     live = drive(scenario, record=record, port=port, browser=browser, device=device)
     reason = live.announce_and_wait("drive it")
-    print(f"\nended by {reason} after {1e-3 * live.ms:.1f} s of simulated time")
+    print(f"\nsession ended by {reason} after {1e-3 * live.ms:.1f} s of simulated time")
     for folder in live.recorded:
         print(f"recorded; repeat it: drake-teleop run --inputs {shlex.quote(folder)}")
     if live.ended:

@@ -134,8 +134,8 @@ class _Station:
     def signal_value(self, signal: str) -> Array:
         return np.array(self.station.GetOutputPort(signal).Eval(self.context))
 
-    def set_clutch(self, closed: bool) -> None:
-        self.station.GetInputPort("clutch").FixValue(self.context, [float(closed)])
+    def set_clutch(self, is_engaged: bool) -> None:
+        self.station.GetInputPort("clutch").FixValue(self.context, [float(is_engaged)])
 
     def take_over_state(self, replaced: _Station, has_new_channel: bool) -> float:
         """Copy the replaced station's state; cross-fade from its rendered force to the new one.

@@ -131,7 +131,7 @@ class CrossFade(framework.LeafSystem):
         context.get_mutable_discrete_state(self._state)[0] = 0.0
 
     def LimitForce(self, context: Context, max_force: float) -> None:
-        """Limit the force to `max_force` [N] until the new wrench is at most that large."""
+        """Limit the force to `max_force` [N] until the new force is smaller."""
         context.get_mutable_discrete_state(self._state)[1] = max_force
 
     def force_above_limit(self, context: Context) -> float:

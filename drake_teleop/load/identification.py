@@ -114,6 +114,7 @@ class Identification:
         return tuple(np.where(self.identifiable, "identified", rest).tolist())
 
     def with_unidentified_load(self) -> Identification:
+        """Return the result with all load parameters marked as not identified."""
         return replace(self, identifiable=self.identifiable & ~_LOAD_PARAMETER_MASK)
 
     def with_nothing_identified(self) -> Identification:
@@ -201,10 +202,10 @@ def is_precise_enough(standard_deviations: Array, phi: Array) -> NDArray[np.bool
     return standard_deviations <= MAX_IDENTIFIED_RELATIVE_STD * natural_scales(phi)
 
 
-def mark_undetermined(covariance: Array, undetermined: NDArray[np.bool_]) -> Array:
+def mark_undetermined(covariance: Array, is_undetermined: NDArray[np.bool_]) -> Array:
     """Return the covariance (n, n) with variance inf and no correlation for flagged parameters."""
-    out = np.where(undetermined[:, None] | undetermined, 0.0, covariance)
-    out[undetermined, undetermined] = np.inf
+    out = np.where(is_undetermined[:, None] | is_undetermined, 0.0, covariance)
+    out[is_undetermined, is_undetermined] = np.inf
     return out
 
 
@@ -314,12 +315,12 @@ def load_of_object(total: Identification, gripper: Identification) -> Identifica
         phi=phi,
         covariance=covariance,
         identifiable=identifiable,
-        degrees_of_freedom=_degrees_of_freedom_of_load_difference(total, gripper),
+        degrees_of_freedom=_statistical_dof_of_load_difference(total, gripper),
         prior_dominated=total.prior_dominated | gripper.prior_dominated & _LOAD_PARAMETER_MASK,
     )
 
 
-def _degrees_of_freedom_of_load_difference(total: Identification, gripper: Identification) -> Array:
+def _statistical_dof_of_load_difference(total: Identification, gripper: Identification) -> Array:
     a, b = (np.diag(load.covariance) for load in (total, gripper))
     b = np.where(_LOAD_PARAMETER_MASK, b, 0.0)
     finite = np.isfinite(a + b) & (a + b > 0.0)

@@ -50,7 +50,7 @@ def inertia_about_origin(phi: ArrayLike) -> Array:
 
 
 def pseudo_inertia(phi: ArrayLike) -> Array:
-    """Return the pseudo-inertia J = [Sigma, m c; m c^T, m] (4, 4) of phi, Eq. (T1)."""
+    """Return the pseudo-inertia J = [Sigma, m c; m c^T, m] (4, 4), Eq. (T1)."""
     phi = finite_array("phi", phi, 10)
     I = inertia_about_origin(phi)  # noqa: E741
     J = np.empty((4, 4))

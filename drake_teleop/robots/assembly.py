@@ -107,7 +107,7 @@ class DelayTracker:
             self._count = fade * self._count + 1.0
             products = slope, residual, slope * slope, slope * residual, residual * residual
             self._sums = fade * self._sums + np.stack(products)
-            self._slew_delay(min(elapsed, DELAY_FORGETTING_TIME_S))
+            self._change_delay_at_limited_rate(min(elapsed, DELAY_FORGETTING_TIME_S))
 
     def _is_inlier(self, residual: Array, wrench_rate: Array) -> bool:
         starting = self._samples < _MIN_DELAY_SAMPLES
@@ -118,7 +118,7 @@ class DelayTracker:
             offsets = (self._sums[1] - self._sums[0] * self.delay_s) / self._count
         return bool((np.abs(residual - offsets) < limit).all())
 
-    def _slew_delay(self, elapsed_s: float) -> None:
+    def _change_delay_at_limited_rate(self, elapsed_s: float) -> None:
         if self._samples < _MIN_DELAY_SAMPLES:
             return
         g, r, gg, gr, rr = self._sums / self._count

@@ -141,13 +141,13 @@ def advise_motion(
     motion: tuple[Array, Array, Array],
     dt: float,
     cutoff_hz: float | None,
-    errors: Array,
+    derivatives: Array,
     noise: Array,
 ) -> str:
     """Return the next motion that reduces the uncertainty most, in words.
 
-    `motion`: recorded s, omega, alpha, (N, 3) each; `errors`: `derivatives_over_tolerances`;
-    `noise` (6,) [N, N m].
+    `motion`: recorded s, omega, alpha, (N, 3) each; `derivatives` (k, 16): of mass, com x ... by
+    [offsets; phi], divided by tolerances; `noise` (6,) [N, N m].
     """
     rate = 1.0 / dt
     if cutoff_hz is not None:
@@ -160,7 +160,7 @@ def advise_motion(
     last = motion[0][-max(1, round(0.2 / dt)) :].mean(axis=0)
     best, least = "", np.inf
     for words, of_motion in _information_of_advised_motions(last, noise, rate):
-        left = tolerances.deviations_over_tolerances(errors, np.linalg.inv(gram + of_motion))
+        left = tolerances.deviations_over_tolerances(derivatives, np.linalg.inv(gram + of_motion))
         cost = float(np.log(np.maximum(left, 1.0)).sum()) + 1e-6 * float(left.sum())
         if cost < least:
             best, least = words, cost

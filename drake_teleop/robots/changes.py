@@ -90,7 +90,7 @@ class ZeroAndLoadMonitor:
     def _report_changes(self, found: Future[list[TimedChangeText]]) -> None:
         error = found.exception()
         if error is not None:  # the loop continues
-            self._report(f"the test for a tare or another load failed ({error})")
+            self._report(f"error in the test for a tare or another load ({error})")
             return
         for time, words in found.result():
             if all(abs(time - t) > _MIN_REPORTED_CHANGE_SPACING_S for t in self._reported):

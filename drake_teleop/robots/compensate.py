@@ -150,13 +150,13 @@ def run_compensate_command(
     for path in file:
         refuse_to_replace_inputs(path, *input_files)
     if earlier := move_earlier_recordings(*file if readings.live else ()):
-        report(f"{sink} exists; it is moved to {earlier}")
+        report(f"{sink} exists; the existing file is moved to {earlier}")
     wrenches = open_sink(sink)
     changes = ZeroAndLoadMonitor(readings.dt, live=readings.live, report=report) if watch else None
     for note in notes_on_undetermined_load(found):
         report(f"warning: {note}")
     late_s = 0.0 if predicted else compensator.lag_s
-    report(f"outputs are {1e3 * (getattr(readings, 'lag_s', 0.0) + late_s):.1f} ms late")
+    report(f"output delay: {1e3 * (getattr(readings, 'lag_s', 0.0) + late_s):.1f} ms")
     stale_ms = 1e3 * compensator.stale_age_s
     report(f"readings are stale after {stale_ms:.0f} ms; invalid wrenches are zero")
     if sensor_range is None:
@@ -166,8 +166,8 @@ def run_compensate_command(
         counts = compensate_stream(readings, compensator, wrenches, **loop)
         report(", ".join(f"{name} {count}" for name, count in counts.items()))
         if isinstance(readings, ReadingAssembler):
-            report(f"at the end outputs were {1e3 * (readings.lag_s + late_s):.1f} ms late")
-            report(f"delay of the motion at the end: {1e3 * readings.delay_s:.1f} ms")
+            report(f"output delay at the end: {1e3 * (readings.lag_s + late_s):.1f} ms")
+            report(f"delay of motion behind wrench at the end: {1e3 * readings.delay_s:.1f} ms")
     finally:
         with ExitStack() as stack:
             for each in (wrenches, readings, control_port, changes):

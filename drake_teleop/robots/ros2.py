@@ -36,7 +36,7 @@ MESSAGE_TYPE_OF_TOPIC = {
 }
 _STREAM_OF_TOPIC = {"tf": POSE}
 _MAX_TRANSFORM_CHAIN_FRAMES = 64
-SOURCE_PARAMETERS = ("pose", "imu", "joints", "tf", "domain", "sign")
+SOURCE_ADDRESS_PARAMETERS = ("pose", "imu", "joints", "tf", "domain", "sign")
 """Parameters of a source's address."""
 
 
@@ -216,7 +216,7 @@ class Ros2Source(streams.Source):
 
     @delayed_signals()
     def __init__(self, address: str, dt: float, joints: tuple[str, ...] = ()) -> None:
-        parsed = parse_ros2_address(address, SOURCE_PARAMETERS)
+        parsed = parse_ros2_address(address, SOURCE_ADDRESS_PARAMETERS)
         self.dt, sign, domain = dt, parsed.wrench_sign(), domain_of_address(parsed)
         topics, frames, self.streams = topics_frames_and_streams(parsed, joints)
         classes = {name: message_class(MESSAGE_TYPE_OF_TOPIC[name], address) for name in topics}

@@ -16,7 +16,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.ros2 import (
     MESSAGE_TYPE_OF_TOPIC,
-    SOURCE_PARAMETERS,
+    SOURCE_ADDRESS_PARAMETERS,
     WRENCH_STAMPED,
     MessageConverter,
     checked_topic_name,
@@ -138,7 +138,7 @@ class ZenohSource(Source):
     """
 
     def __init__(self, address: str, dt: float, joints: tuple[str, ...] = ()) -> None:
-        parsed = Address(address, DEFAULT_ROUTER_PORT, allowed=SOURCE_PARAMETERS)
+        parsed = Address(address, DEFAULT_ROUTER_PORT, allowed=SOURCE_ADDRESS_PARAMETERS)
         self.dt, sign, domain = dt, parsed.wrench_sign(), domain_of_address(parsed)
         topics, frames, self.streams = topics_frames_and_streams(parsed, joints)
         require_libraries(address)

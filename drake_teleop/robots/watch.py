@@ -72,7 +72,7 @@ class ContactAndLoadMonitor:
 
 MEAN_WRENCH_TIME_CONSTANT_S = 3.0
 """Time constant of the mean contact wrench outside of contact [s]."""
-_GRAVITY_CUTOFF_HZ = 0.5
+_GRAVITY_LOW_PASS_CUTOFF_HZ = 0.5
 _CONTACT_STATISTIC_NAME = "level"
 _RELATIVE_FREE_LOG_RATE_TOLERANCE = 0.05
 
@@ -99,10 +99,10 @@ class StreamContactDetector:
             remedy = "use the log that `calibrate` wrote from this stream"
             raise DrakeTeleopError(what, where=str(free), remedy=remedy)
         self._fast = low_pass_and_settled_state(dt, cutoff_hz)
-        self._slow = low_pass_and_settled_state(dt, _GRAVITY_CUTOFF_HZ)
+        self._slow = low_pass_and_settled_state(dt, _GRAVITY_LOW_PASS_CUTOFF_HZ)
         readings = [each for each in source.read(0.0) or () if not each.flags]
         values = np.array([each.values for each in readings]).reshape(-1, 15)
-        transient = round(0.5 / (_GRAVITY_CUTOFF_HZ * dt))  # of the low-passes
+        transient = round(0.5 / (_GRAVITY_LOW_PASS_CUTOFF_HZ * dt))  # of the low-passes
         if len(values) < (required := transient + detection.MIN_NOISE_FLOOR_SAMPLES):
             what = f"has {len(values)} valid readings, too few for a noise floor"
             remedy = f"give a log of free motion with at least {required}"
@@ -113,7 +113,7 @@ class StreamContactDetector:
         contact -= contact[: round(0.5 / dt)].mean(axis=0)  # as a tare
         contact = causal_low_pass(contact, dt, cutoff_hz, ahead_s)
         fast = causal_low_pass(values[:, 6:], dt, cutoff_hz)
-        slow_s = causal_low_pass(values[:, 6:9], dt, _GRAVITY_CUTOFF_HZ)
+        slow_s = causal_low_pass(values[:, 6:9], dt, _GRAVITY_LOW_PASS_CUTOFF_HZ)
         settled = np.hstack([contact, fast, fast[:, :3] - slow_s])[transient:]
         hold = round(1.0 / (cutoff_hz * dt))
         fade = float(np.exp(-1.0 / hold))

@@ -77,13 +77,13 @@ class GuidedExperiment:
         name = f"{procedure.num_completed_trials:04}-{procedure.interval}"
         setup = with_noise_seed_of_interval(self._apparatus.scenario, procedure)
         station = setup, self._apparatus.load, self._drives / name
-        show = self._log_rows_and_return_scene_values
+        show = self._store_rows_and_get_scene_values
         self._live = Live(*station, show, now, self._link, log=False, begin=self._stimulus)
         self._intervals += 1
         if self._driver is not None:
             self._live.join(self._driver, now)
 
-    def _log_rows_and_return_scene_values(self, rows: dict[str, np.ndarray]) -> dict[str, Any]:
+    def _store_rows_and_get_scene_values(self, rows: dict[str, np.ndarray]) -> dict[str, Any]:
         self._rows.add_rows(rows)
         hidden = ("measured_wrench_S", "load_estimate")
         return self._show(rows | {name: np.zeros_like(rows[name]) for name in hidden})
@@ -229,7 +229,7 @@ class GuidedExperiment:
 
 
 def parse_experiment_message(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests in a message that participants may make; None without any."""
+    """Return the valid requests of a participant in a message, or None."""
     message = parse_message(text) or {}
     found = {name: message[name] for name in message.keys() & {"drive", "go", "answer"}}
     for kind in message.keys() & {"set", "rates"}:

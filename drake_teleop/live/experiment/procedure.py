@@ -162,7 +162,7 @@ class Procedure:
         if self.phase == ANSWER_PHASE:
             self._finish_trial(interval, interval == self.trial.signal_interval, time_s)
 
-    def _finish_trial(self, answer: int, correct: bool, time_s: float) -> None:
+    def _finish_trial(self, answer: int, is_correct: bool, time_s: float) -> None:
         trial, results = self.trial, self._results
         row = TrialRow(
             trial=self.num_completed_trials,
@@ -172,7 +172,7 @@ class Procedure:
             level=max(f.level for f in results),
             signal=trial.signal_interval,
             answer=answer,
-            correct=int(correct),
+            correct=int(is_correct),
             time_s=round(time_s, 4),
             force_N=max(f.force_N for f in results),
             lost_s=sum(f.lost_s for f in results),
@@ -180,7 +180,7 @@ class Procedure:
         self.store.write_rows(self.participant, [*self._rows, row])
         self._rows.append(row)
         self._update_psi_method_and_contact_forces(trial, row)
-        self.is_answer_right = bool(correct)
+        self.is_answer_right = bool(is_correct)
         if trial.practice:
             self.phase = FEEDBACK_PHASE
         else:

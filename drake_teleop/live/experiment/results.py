@@ -51,7 +51,7 @@ def compute_results(experiment: Experiment, store: TrialStore) -> list[ResultRow
             each: dict[str, list[ResultRow]] = {}
             for n, rows in known.items():
                 done = [r for r in rows if (r.task, r.condition) == (kind, condition.name)]
-                for quantity, estimate in _estimate_quantities(task, done).items():
+                for quantity, estimate in _estimate_task_results(task, done).items():
                     result = ResultRow(kind, condition.name, n, len(done), quantity, *estimate)
                     each.setdefault(quantity, []).append(result)
             for quantity, one in each.items():
@@ -64,7 +64,7 @@ def compute_results(experiment: Experiment, store: TrialStore) -> list[ResultRow
     return found
 
 
-def _estimate_quantities(task: Task, rows: Sequence[TrialRow]) -> dict[str, EstimateWithLimits]:
+def _estimate_task_results(task: Task, rows: Sequence[TrialRow]) -> dict[str, EstimateWithLimits]:
     if not rows:
         return {}
     if isinstance(task, PegInSlot):

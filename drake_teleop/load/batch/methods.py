@@ -162,7 +162,7 @@ def _std_growth_by_rejection(full_fit: EstimatorFit, kept_moments: SecondMoments
 
 
 class Method(NamedTuple):
-    """Batch estimator: value of `Identification.method`, and function that fits a record."""
+    """Batch estimator: its name in results, and function that fits a record."""
 
     name: str
     fit: Callable[[SampleRecord, EstimatorOptions], EstimatorFit]

@@ -52,7 +52,7 @@ def allocate_work_arrays():
 
 
 @njit(cache=True)
-def write_products_vector(wrench, motion, z):
+def write_moment_vector(wrench, motion, z):
     omega = motion[3:6]
     z[0], z[1:4], z[4:7], z[_WRENCH_START_IN_Z:] = 1.0, motion[:3], motion[6:], wrench
     for i in range(3):
@@ -68,7 +68,7 @@ def add_outer_product(y, z, total):
 
 
 @njit(cache=True)
-def discount_samples_and_recentre_prior(memory, theta, information, forgetting):
+def discount_samples_and_set_prior_to_theta(memory, theta, information, forgetting):
     memory[:-1] *= forgetting
     memory[-1, :16] = information * theta
 
@@ -269,8 +269,8 @@ def rtls_update(
     Z, options = memory[:19], (noise_std, motion_std, index, factors)
     for n in range(len(samples)):
         if forgetting < 1.0:
-            discount_samples_and_recentre_prior(memory, theta, information, forgetting)
-        write_products_vector(samples[n, WRENCH_SLICE], samples[n, MOTION_SLICE], z)
+            discount_samples_and_set_prior_to_theta(memory, theta, information, forgetting)
+        write_moment_vector(samples[n, WRENCH_SLICE], samples[n, MOTION_SLICE], z)
         add_outer_product(z, z, Z)
         scale = write_rtls_normal_equations(Z, theta, *options, scratch, Q, G, N)
         for i in range(16):
