@@ -156,7 +156,7 @@ def detect_command(
     delay: str | float = "auto",
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Detect contact in a log, write statistics and contact flags, return the summary."""
+    """Detect contact in a log by noise of `free` motion, write flags, return the summary."""
     found = processing.detect_log(
         log, load, free=free, statistic=statistic, cutoff_hz=cutoff_hz, delay=delay
     )

@@ -178,7 +178,7 @@ def input_range(name: str) -> tuple[int, int]:
 def inputs_at_displacement(
     displacement: Sequence[float] | Array, rotation: Any
 ) -> dict[str, float]:
-    """Return held, x ... rz of a hand at a displacement, as floats in units of `Inputs`.
+    """Return held, x ... rz of a hand at a displacement, in 10 um and 0.1 mrad.
 
     `displacement` (3,) is in B [m], `rotation` a quaternion [w, x, y, z].
     """

@@ -60,7 +60,7 @@ def checked_topic_name(address: Address, name: str) -> str:
 def topics_frames_and_streams(
     address: Address, joints: tuple[str, ...]
 ) -> tuple[dict[str, str], tuple[str, ...], tuple[str, ...]]:
-    """Return the topics by name, the frames (parent, child) of `tf`, and the streams."""
+    """Return topics by name, frames (parent, child) of `tf`, streams; `joints`: the arm's."""
     topics = {WRENCH: checked_topic_name(address, address.path)}
     for stream in (POSE, IMU, JOINTS):
         if (text := address.optional_parameter(stream)) is not None:

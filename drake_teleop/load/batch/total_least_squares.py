@@ -36,7 +36,7 @@ class SolvedNormalEquations(NamedTuple):
     Attributes:
         gram: (16, 16) Gram matrix per sample, without the part due to motion noise.
         weights: (6, 6) weighting matrix of the residual.
-        noise_scale: ratio of residual variance to specified noise variance.
+        noise_scale: ratio of observed to given noise variance.
         map_from_ordinary: (16, 16) matrix that maps the ordinary least squares theta to this one.
     """
 

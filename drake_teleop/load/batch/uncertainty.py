@@ -245,7 +245,7 @@ def covariance_for_gain_errors(fit: EstimatorFit, offsets_estimated: bool) -> Ar
 def covariance_of_solution(
     least_squares_covariance: Array, solved: SolvedNormalEquations, offsets_estimated: bool
 ) -> Array:
-    """Return the covariance (16, 16) of `solved.theta` from that of ordinary least squares."""
+    """Return the covariance (16, 16) of [offsets; phi] from that of ordinary least squares."""
     unknown = np.isinf(np.diag(least_squares_covariance))
     covariance = np.where(unknown[:, None] | unknown, 0.0, least_squares_covariance)
     if not offsets_estimated:

@@ -254,7 +254,7 @@ def fit_noise_floor(
     *,
     fade: float = 0.0,
 ) -> NoiseFloor:
-    """Return the noise floor fitted to the arrays of a `DetectorSamples` in free motion."""
+    """Return the noise floor of free motion; `fade`: factor per sample on held accelerations."""
     from scipy.optimize import nnls
 
     rows = validate_detector_samples(contact, s, omega, alpha, acceleration)
