@@ -251,7 +251,8 @@ def _parse_file_field(where: str, name: str, value: Any) -> Any:
             raise _file_error("is not a list of 16 true or false", where)
         return np.array(flags, dtype=bool)
     if name == "degrees_of_freedom":
-        given, what = value if isinstance(value, list) else [""], "is not 16 numbers or null"
+        given = value if isinstance(value, list) else [""]
+        what = "is not a list of 16 numbers or null"
         _require_numbers(where, [v for v in given if v is not None], what)
         degrees = finite_array(where, [1.0 if v is None else v for v in given], 16)
         if (degrees <= 0.0).any():
