@@ -23,18 +23,18 @@ from drake_teleop.common.vectors import copy_into
 from drake_teleop.load.online.recursive_tls import (
     MomentEstimator,
     add_outer_product,
-    allocate_scratch,
-    discount_samples_and_recentre_prior,
-    eliminate_rows,
+    allocate_work_arrays,
+    discount_samples_and_set_prior_to_theta,
+    eliminate_below_diagonal,
     nonzero_regressor_terms,
     solve_augmented_system_in_place,
     write_inverse_6x6,
-    write_products_vector,
+    write_moment_vector,
     write_residual_products,
     write_weighted_gram,
     write_weighted_right_side,
 )
-from drake_teleop.load.regressor import SAMPLE_MOTION, SAMPLE_WRENCH
+from drake_teleop.load.regressor import MOTION_SLICE, WRENCH_SLICE
 
 INSTRUMENTS = slice(15, 24)  # motion from a second source, after the sample
 
@@ -76,7 +76,7 @@ def riv_normal_equations(memory, theta, noise_std, information, index, factors, 
             A[i, j] = 0.0
         A[i, i] = information[i]
         A[i, 16] = memory[57, i]
-    eliminate_rows(MRg)
+    eliminate_below_diagonal(MRg)
     for k in range(16):
         pivot = 1.0 / MRg[k, k]
         for i in range(16):
@@ -95,14 +95,14 @@ def riv_update(theta, memory, samples, noise_std, forgetting, information, index
         samples: (N, 24) [wrench, s, omega, alpha, instruments (s, omega, alpha)].
         forgetting: factor per sample on the weight of the past.
     """
-    space, MRg, A = allocate_scratch(), np.empty((16, 33)), np.empty((16, 17))
+    space, MRg, A = allocate_work_arrays(), np.empty((16, 33)), np.empty((16, 17))
     y, z = np.empty(19), np.empty(19)
     for n in range(len(samples)):
         if forgetting < 1.0:
-            discount_samples_and_recentre_prior(memory, theta, information, forgetting)
-        wrench = samples[n, SAMPLE_WRENCH]
-        write_products_vector(wrench, samples[n, SAMPLE_MOTION], z)
-        write_products_vector(wrench, samples[n, INSTRUMENTS], y)
+            discount_samples_and_set_prior_to_theta(memory, theta, information, forgetting)
+        wrench = samples[n, WRENCH_SLICE]
+        write_moment_vector(wrench, samples[n, MOTION_SLICE], z)
+        write_moment_vector(wrench, samples[n, INSTRUMENTS], y)
         add_outer_product(z, z, memory[:19])
         add_outer_product(y, z, memory[19:38])
         add_outer_product(y, y, memory[38:57])
@@ -126,7 +126,7 @@ class RecursiveInstrumentalVariables(MomentEstimator):
         """Return the covariance (16, 16), (R^T M^-1 R + prior)^-1."""
         A, MRg = np.empty((16, 17)), np.empty((16, 33))
         options = (self._noise_std, 1.0 / self._prior, *nonzero_regressor_terms())
-        riv_normal_equations(memory, theta, *options, allocate_scratch(), MRg, A)
+        riv_normal_equations(memory, theta, *options, allocate_work_arrays(), MRg, A)
         return self._limit_variances_to_prior(np.linalg.inv(0.5 * (A[:, :16] + A[:, :16].T)))
 
     def update_samples(

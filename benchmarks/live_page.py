@@ -25,7 +25,7 @@ from browser import CHROMIUM, Page, opened
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.live.hand import TARGET_LEAD_TIME_S
-from drake_teleop.live.live import MIN_DISPLAYED_TOUCH_FORCE_N, Live
+from drake_teleop.live.live import MIN_GAMEPAD_TOUCH_FORCE_N, Live
 from drake_teleop.live.scenarios import live_scenario
 from drake_teleop.live.server import LiveDrive, drive
 from drake_teleop.live.session import Session
@@ -190,8 +190,8 @@ def free_motion(seconds: float) -> dict[str, float]:
         "free_s": seconds,
         "free_peak_acceleration": fastest,
         "free_contact_force_max_N": float(forces[:, 0].max()),
-        "free_vibrates_by_contact": float((forces[:, 0] >= MIN_DISPLAYED_TOUCH_FORCE_N).mean()),
-        "free_vibrates_by_measured": float((forces[:, 1] >= MIN_DISPLAYED_TOUCH_FORCE_N).mean()),
+        "free_vibrates_by_contact": float((forces[:, 0] >= MIN_GAMEPAD_TOUCH_FORCE_N).mean()),
+        "free_vibrates_by_measured": float((forces[:, 1] >= MIN_GAMEPAD_TOUCH_FORCE_N).mean()),
     }
 
 

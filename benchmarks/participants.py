@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from drake_teleop.live.experiment.psychometrics import PsiMethod, correct_probability
+from drake_teleop.live.experiment.psychometrics import PsiMethod, correct_answer_probability
 
 LOW, HIGH = 0.2, 20.0
 """Range of the levels, for example in N."""
@@ -35,12 +35,12 @@ Curve = Callable[[float], float]
 def as_thought(rng: np.random.Generator, threshold: float) -> Curve:
     """Return a curve with slope and lapses in the range that `PsiMethod` assumes."""
     slope, lapse = np.exp(rng.uniform(np.log(0.7), np.log(3.0))), rng.uniform(0.0, 0.06)
-    return lambda x: float(correct_probability(x, threshold, slope, lapse))
+    return lambda x: float(correct_answer_probability(x, threshold, slope, lapse))
 
 
 def without_lapse(rng: np.random.Generator, threshold: float) -> Curve:
     """Return a curve without lapses, with d' proportional to the level."""
-    return lambda x: float(correct_probability(x, threshold, 1.0, 0.0))
+    return lambda x: float(correct_answer_probability(x, threshold, 1.0, 0.0))
 
 
 def weibull(rng: np.random.Generator, threshold: float) -> Curve:
@@ -51,7 +51,7 @@ def weibull(rng: np.random.Generator, threshold: float) -> Curve:
 
 def inattentive(rng: np.random.Generator, threshold: float) -> Curve:
     """Return a curve with lapses in 10 % of the trials, beyond the range of `PsiMethod`."""
-    return lambda x: float(correct_probability(x, threshold, 1.5, 0.1))
+    return lambda x: float(correct_answer_probability(x, threshold, 1.5, 0.1))
 
 
 def noticing(rng: np.random.Generator, threshold: float) -> Curve:

@@ -34,7 +34,7 @@ from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.logs.sample import sample_log_command
 from drake_teleop.robots.compensate import compensate_stream
-from drake_teleop.robots.compensator import TARE_REST_S, Compensator
+from drake_teleop.robots.compensator import TARE_AVERAGING_S, Compensator
 from drake_teleop.robots.replay_log import ReplayLogSource
 from drake_teleop.robots.streams import CompensatedWrench
 
@@ -93,7 +93,7 @@ def left(path: Path, load: Identification) -> dict[str, float]:
     def of(**options: Any) -> EliminatedLog:
         return eliminate_log(path, load, causal="delayed", **options)
 
-    own, tared, file = of(), of(causal_tare_s=TARE_REST_S), of(tare=False)
+    own, tared, file = of(), of(causal_tare_s=TARE_AVERAGING_S), of(tare=False)
     assert own.causal is not None and tared.causal is not None and file.causal is not None
     later = tared.causal.offsets - file.offsets
     return {
@@ -108,7 +108,7 @@ def left(path: Path, load: Identification) -> dict[str, float]:
 
 def removed(path: Path, load: Identification) -> float:
     """Return the removed share of the force where `eliminate` has no contact."""
-    found = eliminate_log(path, load, causal="delayed", causal_tare_s=TARE_REST_S)
+    found = eliminate_log(path, load, causal="delayed", causal_tare_s=TARE_AVERAGING_S)
     assert found.causal is not None
     free = ~found.touched
     return 1.0 - rms(found.causal.contact[free]) / rms(found.measured[free])

@@ -36,7 +36,7 @@ def calibrate_command(
 ) -> dict[str, Any]:
     """Identify a load from a live source; write the results into `out` and return the summary.
 
-    `until` is the required accuracy, `sensor_range` the largest force and torque.
+    `until`: required accuracy; `sensor_range`: force [N] and torque [N m]; `seconds`: record limit.
     """
     tolerance = tolerances.parse_tolerance(until)
     files.make_folder(out)
@@ -49,8 +49,8 @@ def calibrate_command(
         files.refuse_to_replace_inputs(path, *stream.files)
         with Live(console=console, auto_refresh=False) as live:
 
-            def show_progress(at: RecordEvaluation) -> None:
-                live.update(make_progress_table(at, tolerance), refresh=True)
+            def show_progress(evaluation: RecordEvaluation) -> None:
+                live.update(make_progress_display(evaluation, tolerance), refresh=True)
 
             evaluations = calibrate(
                 stream, recorder, path, tolerance, seconds=seconds, show=show_progress, **processing
@@ -80,7 +80,7 @@ def calibrate_command(
     return summary
 
 
-def make_progress_table(evaluation: RecordEvaluation, tolerance: tolerances.Tolerance) -> Group:
+def make_progress_display(evaluation: RecordEvaluation, tolerance: tolerances.Tolerance) -> Group:
     table = Table(title=f"{evaluation.record_length_s:.1f} s recorded", title_justify="left")
     table.add_column("")
     for heading in ("value", "+- (95 %)", "required", "unit"):
@@ -101,7 +101,7 @@ def make_progress_table(evaluation: RecordEvaluation, tolerance: tolerances.Tole
         table.add_row(
             *(entry, *numbers, f"{sizes[k]:.3g}" if np.isfinite(sizes[k]) else "?", units[k]),
             _make_accuracy_bar(half, is_known=bool(evaluation.is_known[k])),
-            _describe_entry_accuracy(evaluation, k),
+            _describe_parameter_accuracy(evaluation, k),
         )
     lines = [Text(line, style="red") for line in (*evaluation.doubts, evaluation.failure) if line]
     if evaluation.advice:
@@ -116,7 +116,7 @@ def _make_accuracy_bar(relative_half_width: float, *, is_known: bool) -> Text:
     return Text("█" * cells + "·" * (_BAR_CHARACTERS - cells), style=colour)
 
 
-def _describe_entry_accuracy(evaluation: RecordEvaluation, index: int) -> str:
+def _describe_parameter_accuracy(evaluation: RecordEvaluation, index: int) -> str:
     if evaluation.is_known[index]:
         return "known"
     if not np.isfinite(evaluation.relative_half_widths[index]):
@@ -145,7 +145,7 @@ def draw_accuracy(evaluations: list[RecordEvaluation], tolerance: tolerances.Tol
                 axes.axvline(x, color=GREY, linewidth=0.6)
                 words = at.advice.split(",")[0].split(":")[0].replace(" the wrist", "")
                 axes.text(x, 0.02, words, rotation=90, size=7, transform=transform)
-        axes.set_title("Half-width of the 95 % interval over the tolerance")
+        axes.set_title("Half-width of the 95 % confidence interval / tolerance")
         axes.set(xlabel="length of the record [s]", yscale="log")
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure

@@ -57,9 +57,9 @@ def excite_command(
     """Design, check and write an excitation trajectory; return its results.
 
     Args:
-        model: model file of another arm; the sensor is the scenario's.
+        model: model file of another arm with the scenario's sensor; None: the scenario's arm.
         sensor_frame: name of the sensor's frame, required with `model`.
-        until: required accuracy of the load; replaces criterion, period and seconds.
+        until: required accuracy of the load; replaces criterion, period [s] and CPU time `seconds`.
         quiet: True hides progress bars and tables; `progress` False hides only the bars.
     """
     tolerance = None if until is None else parse_tolerance(until)
@@ -195,22 +195,22 @@ def _draw_joint_angles(axes: Axes, excitation: Excitation) -> None:
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
-def _draw_heaviest_load_wrench(forces: Axes, torques: Axes, excitation: Excitation) -> None:
+def _draw_heaviest_load_wrench(force_axes: Axes, torque_axes: Axes, excitation: Excitation) -> None:
     limits = excitation.robot.limits
     s, omega, alpha = trajectory_sensor_motion(excitation.robot, excitation.trajectory)
     wrench = non_contact_wrench(s, omega, alpha, limits.heaviest_phi)
     t = np.arange(len(wrench)) / CHECK_RATE_HZ
     for axes, part, limit, unit in (
-        (forces, wrench[:, :3], limits.max_sensor_norms[0], "N"),
-        (torques, wrench[:, 3:], limits.max_sensor_norms[1], "N m"),
+        (force_axes, wrench[:, :3], limits.max_sensor_norms[0], "N"),
+        (torque_axes, wrench[:, 3:], limits.max_sensor_norms[1], "N m"),
     ):
         axes.plot(t, part, linewidth=0.9, label=list("xyz"))
         axes.plot(t, np.linalg.norm(part, axis=1), color=GREY, label="norm")
         axes.axhline(limit, color=BLACK, linestyle=":", label="limit")
         title = f"{'Force' if unit == 'N' else 'Torque'} at the sensor, heaviest load [{unit}]"
         axes.set(title=title, xlim=(0, excitation.trajectory.period))
-    forces.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
-    torques.set_xlabel("t [s]")
+    force_axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    torque_axes.set_xlabel("t [s]")
 
 
 def _print_summary(summary: dict[str, Any], out: Path) -> None:

@@ -42,7 +42,7 @@ def experiment_command(
 def next_participant(
     store: TrialStore, trials_per_participant: int, requested_number: int | None = None
 ) -> int:
-    """Return the requested number, or that of the first unfinished participant, or a new one."""
+    """Return the requested, else the first unfinished, else a new participant number."""
     if requested_number is not None:
         return requested_number
     known = store.participant_numbers()

@@ -87,7 +87,7 @@ def eliminate_command(
 ) -> dict[str, Any]:
     """Remove the load's wrench from a log, write the contact wrench, return the summary.
 
-    `options` are other options of `eliminate_log`.
+    `offsets` is their source: "record" or "load".
     """
     load_file = Identification.load(load)
     tare = offsets == "record"
@@ -106,15 +106,15 @@ def eliminate_command(
     }
     if found.tare_fraction < 0.5:
         summary["notes"].append(
-            "less than half of the record agrees on the sensor's offsets: if the tool is in contact"
+            "less than half of the record has the same sensor offsets: if the tool is in contact"
             " most of the time, the contact wrench may have a constant error"
         )
     if found.detection is not None:
         summary["notes"] += found.detection.notes
     elif not found.log.static:
-        few = f"{len(found.log)} samples are too few to separate contact from noise"
+        few = f"contact flags are all False: {len(found.log)} samples are too few"
         required = f"record at least {MIN_NOISE_FLOOR_SAMPLES} besides both ends"
-        summary["notes"].append(f"contact flags are all False: {few}; {required}")
+        summary["notes"].append(f"{few} to separate contact from noise; {required}")
     summary = files.to_json_data(
         summary
         | summaries.summarize_wrenches(found)
@@ -156,7 +156,7 @@ def detect_command(
     delay: str | float = "auto",
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Detect contact in a log, write statistics and contact flags, return the summary."""
+    """Detect contact in a log by noise of `free` motion, write flags, return the summary."""
     found = processing.detect_log(
         log, load, free=free, statistic=statistic, cutoff_hz=cutoff_hz, delay=delay
     )
@@ -216,14 +216,14 @@ def print_identification(summary: dict[str, Any], out: Path) -> None:
     headings = ("", "value", "std", "unit")
     table = _make_empty_table("Load identified from", summary, headings, left_aligned=("", "unit"))
     offsets, deviations, units = summary["offsets"], summary["offsets_std"], ["N", "N m"]
-    rows = _load_parameter_rows(summary) + [
+    rows = _make_parameter_rows(summary) + [
         (name, offsets[i], deviations[i], 1.0, units[i // 3], name)
         for i, name in enumerate(PARAMETER_NAMES[:6])
     ]
     _add_parameter_rows(table, rows, summary["identifiable"])
     if "object" in summary:
         table.add_section()
-        rows = [(f"object: {row[0]}", *row[1:]) for row in _load_parameter_rows(summary["object"])]
+        rows = [(f"object: {row[0]}", *row[1:]) for row in _make_parameter_rows(summary["object"])]
         _add_parameter_rows(table, rows, summary["object"]["identifiable"])
     figures = (
         "com from, and inertia about, the origin So of the sensor frame S\n"
@@ -240,7 +240,7 @@ _ParameterRow: TypeAlias = tuple[str, float, float, float, str, str]
 """Table row: label, value, standard deviation, factor from SI to the unit, unit, parameter."""
 
 
-def _load_parameter_rows(load: dict[str, Any]) -> list[_ParameterRow]:
+def _make_parameter_rows(load: dict[str, Any]) -> list[_ParameterRow]:
     rows: list[_ParameterRow] = [("mass", load["mass"], load["mass_std"], 1.0, "kg", "m")]
     rows += [
         (f"com {axis}", load["com"][i], load["com_std"][i], 1e3, "mm", f"m c_{axis}")

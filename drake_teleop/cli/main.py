@@ -1,4 +1,4 @@
-"""Commands of `drake-teleop` (long: one file for all commands). Imports packages on demand."""
+"""Commands of `drake-teleop` (long: one file for all commands)."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from drake_teleop.common.version import __version__
 @click.version_option(__version__, prog_name="drake-teleop")
 @option.path_option(
     "--register",
-    "scripts",
+    "registration_scripts",
     multiple=True,
     metavar="FILE",
     help="Python file that registers your own parts (docs/extend.md); may be repeated.",
 )
-def cli(scripts: tuple[Path, ...]) -> None:
+def cli(registration_scripts: tuple[Path, ...]) -> None:
     """Bilateral teleoperation with non-contact force scaling: simulate it, or use it on logs.
 
     Every command with --out writes its results (name: value) into DIR/summary.json. A command with
@@ -36,7 +36,7 @@ def cli(scripts: tuple[Path, ...]) -> None:
     The Tab key completes commands and names in bash (zsh, fish: zsh_source, fish_source) after
     eval "$(_DRAKE_TELEOP_COMPLETE=bash_source drake-teleop)"
     """
-    for script in scripts:
+    for script in registration_scripts:
         from drake_teleop.common.registry import register_from_script
 
         register_from_script(script)
@@ -137,7 +137,7 @@ def drive(
 
         run_drive_command(scenario, record=record, **options)
         return
-    option.refuse_given_options("record", remedy="remove it: --results contains the recording")
+    option.refuse_given_options("record", remedy="remove --record; --results is its folder")
     if simulated:
         unused = ("participant", "port", "no_browser", "device")
         option.refuse_given_options(*unused, remedy="remove it or --simulated")
@@ -226,7 +226,7 @@ def identify(log: Path, out: Path, **options: Any) -> None:
 @option.load_file_option(required=True)
 @option.gripper_file_option
 @option.sigma_option
-@click.option("--sigma-object", type=option.SCALE_TYPE)
+@click.option("--sigma-object", type=option.FORCE_SCALE_TYPE)
 @option.sigma_weight_and_inertia_options
 @option.gamma_option
 @option.float_option("--eta", limits=(0, 1))
@@ -234,7 +234,7 @@ def identify(log: Path, out: Path, **options: Any) -> None:
 @option.float_option("--untouched", "untouched_s", limits=(0, 36000), nargs=2, metavar="START STOP")
 @click.option("--causal", type=click.Choice(["delayed", "predicted"]))
 @option.float_option(
-    "--causal-tare", "causal_tare_s", limits=(0, 36000), min_open=True, metavar="SECONDS"
+    "--causal-tare", "causal_tare_s", limits=(0, 36000), excludes_min=True, metavar="SECONDS"
 )
 @option.free_motion_log_option
 @option.output_folder("eliminate")
@@ -351,8 +351,8 @@ def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
     SOURCE is udp://[HOST]:PORT, posed://[HOST]:PORT, rtde://HOST, netft://HOST, ros2://TOPIC,
     zenoh://HOST/TOPIC, - for lines of JSON on stdin, or replay:LOG; SINK is udp://HOST:PORT,
     ros2://TOPIC, zenoh://HOST/TOPIC, foxglove://, - for stdout, or a .csv, .parquet or .mcap file.
-    Invalid wrenches are zero, with a flag. --cutoff is causal here. --delay is the delay of the
-    motion behind the wrench; auto starts with the value in the load file. The command ends with
+    Invalid wrenches are zero, with a flag. --delay is the delay of the motion behind the wrench;
+    auto starts with the value in the load file. The command ends with
     the source or with Ctrl-C.
 
     Options:
@@ -638,12 +638,12 @@ def scaling_study(out: Path, **options: Any) -> None:
 @option.sensor_frame_option()
 @option.package_path_option
 @click.option("--acceleration", type=option.POSITIVE_NUMBER_LIST_TYPE, default=())
-@option.float_option("--payload", limits=(0, 1e4), min_open=True, metavar="KG")
+@option.float_option("--payload", limits=(0, 1e4), excludes_min=True, metavar="KG")
 @option.choice_option("--criterion", ["kappa_w10", "kappa10", "kappa16", "A16", "D16"], "kappa_w10")
 @option.float_option("--period", limits=(0.5, 600), default=6.0, metavar="SECONDS")
 @option.int_option("--harmonics", limits=(2, 20))
 @click.option("--until", metavar="TOLERANCE")
-@option.float_option("--time", "seconds", limits=(0, 1e6), min_open=True, metavar="SECONDS")
+@option.float_option("--time", "seconds", limits=(0, 1e6), excludes_min=True, metavar="SECONDS")
 @option.seed_with_default_0_option
 @option.output_folder("excite")
 @option.quiet_option

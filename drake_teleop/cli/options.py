@@ -129,17 +129,17 @@ class IntegerInRange(click.IntRange):
 
 
 def float_option(
-    *names: str, limits: tuple[float, float], min_open: bool = False, **settings: Any
+    *names: str, limits: tuple[float, float], excludes_min: bool = False, **settings: Any
 ) -> Any:
-    return click.option(*names, type=FiniteNumber(*limits, min_open=min_open), **settings)
+    return click.option(*names, type=FiniteNumber(*limits, min_open=excludes_min), **settings)
 
 
 def int_option(name: str, limits: tuple[int, int], **settings: Any) -> Any:
     return click.option(name, type=IntegerInRange(*limits), **settings)
 
 
-def choice_option(name: str, words: list[str], default: str) -> Any:
-    return click.option(name, type=click.Choice(words), default=default)
+def choice_option(name: str, choices: list[str], default: str) -> Any:
+    return click.option(name, type=click.Choice(choices), default=default)
 
 
 class DelayOrAuto(click.ParamType):
@@ -151,7 +151,7 @@ class DelayOrAuto(click.ParamType):
         return "auto" if value == "auto" else FiniteNumber(-10, 10).convert(value, param, ctx)
 
 
-SCALE_TYPE = FiniteNumber(0, 100)
+FORCE_SCALE_TYPE = FiniteNumber(0, 100)
 POSITIVE_TYPE = FiniteNumber(0, 1e5, min_open=True)
 
 
@@ -230,8 +230,8 @@ cutoff_option = click.option(
 rate_option = partial(click.option, "--rate", "rate_hz", type=POSITIVE_TYPE, metavar="HZ")
 range_option = click.option("--range", "sensor_range", type=POSITIVE_TYPE, nargs=2, metavar="N NM")
 delay_option = click.option("--delay", type=DelayOrAuto(), default="auto")
-sigma_option = click.option("--sigma", type=SCALE_TYPE, default=0.0)
-gamma_option = click.option("--gamma", type=SCALE_TYPE, default=1.0)
+sigma_option = click.option("--sigma", type=FORCE_SCALE_TYPE, default=0.0)
+gamma_option = click.option("--gamma", type=FORCE_SCALE_TYPE, default=1.0)
 load_file_option = partial(path_option, "--load")
 gripper_file_option = path_option("--gripper")
 free_motion_log_option = path_option("--free", metavar="LOG")
@@ -260,7 +260,7 @@ def refuse_without_model(options: dict[str, object]) -> None:
 
 
 def confirm_at_terminal(question: str) -> bool:
-    """Ask a question at the terminal; return True for yes, False for no or without a terminal."""
+    """Ask a question; return True for yes, False for no or without a terminal."""
     return sys.stdin.isatty() and click.confirm(question, err=True)
 
 
@@ -271,7 +271,7 @@ skip_run_count_question_option = click.option(
 
 def sigma_weight_and_inertia_options(command: Any) -> Any:
     for part in ("inertia", "weight"):
-        command = click.option(f"--sigma-{part}", type=SCALE_TYPE)(command)
+        command = click.option(f"--sigma-{part}", type=FORCE_SCALE_TYPE)(command)
     return command
 
 

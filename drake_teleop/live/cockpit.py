@@ -19,13 +19,13 @@ from drake_teleop.station.slave.inverse_kinematics import IkStatus
 
 #: Contact force at the slave that the page shows as contact [N]; noise and motion remain below.
 MIN_CONTACT_FORCE_N = 2.0
-_LIMIT_SHARE_FOR_WARNING = 0.999
+_WARNING_SHARE_OF_LIMIT = 0.999
 _HAND_FORCE_FOR_WARNING_N = 59.0  # N; the limit of a hand is 60 N
 _PACKET_SILENCE_FOR_WARNING_S = 0.05  # s
 
 
 @njit(cache=True)
-def norm_range_into(vectors, origins, out):
+def min_and_max_norm_into(vectors, origins, out):
     """Write smallest and largest norm of vectors[k, :3] - origins[k, :3] to `out` (2,)."""
     least, most = math.inf, 0.0
     for row in range(len(vectors)):
@@ -37,26 +37,26 @@ def norm_range_into(vectors, origins, out):
 
 
 @njit(cache=True)
-def _integrate_hand_and_contact_work(table, t, states, contact_S, hand_E, twist, before, energy):
-    # `energy` [J]: of hand on stylus, of tool on contacts. `before`: t, p_WS, R_WS of the last row.
+def _add_hand_and_contact_work(arm_table, t, states, contact_S, hand_E, twist_E, last_row, energy):
+    # `energy` [J]: of hand on stylus, of tool on contacts. `last_row`: its t, p_WS, R_WS.
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     for row in range(len(t)):
-        forward_kinematics(table, states[row, : table.shape[0] - 1], R_WS, p_WS)
-        if not math.isnan(before[0]):
+        forward_kinematics(arm_table, states[row, : arm_table.shape[0] - 1], R_WS, p_WS)
+        if not math.isnan(last_row[0]):
             power = 0.0
             for i in range(6):
-                power += hand_E[row, i] * twist[row, i]
-            energy[0] += (t[row] - before[0]) * power
+                power += hand_E[row, i] * twist_E[row, i]
+            energy[0] += (t[row] - last_row[0]) * power
             for i in range(3):
                 a, b, turn = (i + 1) % 3, (i + 2) % 3, 0.0
                 for k in range(3):  # half the sum of the axes' cross products from row to row
-                    turn += 0.5 * before[4 + 3 * a + k] * R_WS[b, k]
-                    turn -= 0.5 * before[4 + 3 * b + k] * R_WS[a, k]
+                    turn += 0.5 * last_row[4 + 3 * a + k] * R_WS[b, k]
+                    turn -= 0.5 * last_row[4 + 3 * b + k] * R_WS[a, k]
                 for k in range(3):
-                    work = contact_S[row, k] * (p_WS[i] - before[1 + i])
+                    work = contact_S[row, k] * (p_WS[i] - last_row[1 + i])
                     energy[1] += R_WS[i, k] * (work + contact_S[row, 3 + k] * turn)
-        before[0] = t[row]
-        before[1:4], before[4:] = p_WS, R_WS.ravel()
+        last_row[0] = t[row]
+        last_row[1:4], last_row[4:] = p_WS, R_WS.ravel()
 
 
 class PageValueCalculator:
@@ -66,8 +66,8 @@ class PageValueCalculator:
         arm = slave_arm(scenario)
         self._table, n = arm.table, arm.num_joints
         self._limits = (
-            ("speed", "slave_state", slice(n, None), _LIMIT_SHARE_FOR_WARNING * arm.velocity_limit),
-            ("torque", "joint_torque", slice(None), _LIMIT_SHARE_FOR_WARNING * arm.effort_limit),
+            ("speed", "slave_state", slice(n, None), _WARNING_SHARE_OF_LIMIT * arm.velocity_limit),
+            ("torque", "joint_torque", slice(None), _WARNING_SHARE_OF_LIMIT * arm.effort_limit),
         )
         self._peak_force = scenario.master.device(0.0, 0.0).parameters.peak_force
         self._energy = np.zeros(2)
@@ -79,28 +79,28 @@ class PageValueCalculator:
         zeros = np.zeros((len(rows["t"]), 6))
         contact_S = rows.get("contact_wrench_S", zeros)
         measured, contact, rendered = self._forces
-        norm_range_into(rows["measured_wrench_S"], rows["load_estimate"], measured)
-        norm_range_into(contact_S, zeros, contact)
-        norm_range_into(rows["force_to_master"], zeros, rendered)
+        min_and_max_norm_into(rows["measured_wrench_S"], rows["load_estimate"], measured)
+        min_and_max_norm_into(contact_S, zeros, contact)
+        min_and_max_norm_into(rows["force_to_master"], zeros, rendered)
         touches = rows["contact"].any() if "contact" in rows else contact[1] > MIN_CONTACT_FORCE_N
         self._forces[:2] *= inputs.force_scales["force_scale"]
         t, states, hand, twist = (
             rows[name] for name in ("t", "slave_state", "hand_wrench_E", "twist_master")
         )
-        _integrate_hand_and_contact_work(
+        _add_hand_and_contact_work(
             self._table, t, states, contact_S, hand, twist, self._last_row, self._energy
         )
         return {
             "f": [_round_or_zero_if_not_finite(pair, 4) for pair in self._forces],
             "contact": bool(touches),
             "energy": _round_or_zero_if_not_finite(self._energy, 5),
-            "words": list(dict.fromkeys(self._warning_texts(rows, inputs, zeros))),
+            "words": list(dict.fromkeys(self._warning_texts(rows, inputs))),
             "t": round(float(self._last_row[0]), 3),
             "tool": _round_or_zero_if_not_finite(self._last_row[1:4], 5),
             "stylus": _round_or_zero_if_not_finite(rows["pose_master"][-1, 4:], 5),
         }
 
-    def _warning_texts(self, rows: dict[str, Array], inputs: Inputs, zeros: Array) -> Iterator[str]:
+    def _warning_texts(self, rows: dict[str, Array], inputs: Inputs) -> Iterator[str]:
         for name in ("fault", "fault_at_hand"):
             if name in rows and rows[name].any():
                 faults = set(rows[name][:, 0]) - {0.0}
@@ -109,10 +109,10 @@ class PageValueCalculator:
             yield "the arm cannot reach the position of the hand"
         if rows["saturated"].max() > 0:
             yield "the wrist sensor is saturated"
-        if self._forces[2, 1] >= _LIMIT_SHARE_FOR_WARNING * self._peak_force:
+        if self._forces[2, 1] >= _WARNING_SHARE_OF_LIMIT * self._peak_force:
             yield f"the device renders its largest force, {self._peak_force:g} N"
-        hand = np.empty(2)
-        norm_range_into(rows["hand_wrench_E"], zeros, hand)
+        wrench, hand = rows["hand_wrench_E"], np.empty(2)
+        min_and_max_norm_into(wrench, np.zeros_like(wrench), hand)
         if hand[1] > _HAND_FORCE_FOR_WARNING_N:
             yield "the simulated hand pulls with its largest force"
         for quantity, name, part, limits in self._limits:

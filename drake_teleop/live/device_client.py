@@ -32,7 +32,7 @@ _CLIENT_PERIOD_S, _MAX_CLIENT_PERIOD_S = 1e-3, 0.1  # s
 _MAX_STORED_FORCE_AGES = 100_000  # ticks
 _SIMULATION_STEPS_PER_MS = 10  # per ms
 _VIRTUAL_MASS_KG, _VIRTUAL_DAMPING_NS_M = 0.15, 0.5  # of the device [kg], [N s/m]
-HandMotion: TypeAlias = Callable[[float], tuple[Sequence[float], Sequence[float]]]
+HandMotionFunction: TypeAlias = Callable[[float], tuple[Sequence[float], Sequence[float]]]
 """Function from time [s] to intended position [m] and velocity [m/s]."""
 
 
@@ -43,7 +43,7 @@ class HapticDevice(Protocol):
     def limits(self) -> DeviceLimits: ...
 
     def read(self) -> device_packets.DeviceState | None:
-        """Return the next pose, with number and time 0; None if none arrives within 0.5 s."""
+        """Return the next pose, without number and time; None if none arrives within 0.5 s."""
 
     def set_wrench(self, wrench: Sequence[float]) -> None:
         """Render the wrench [f; tau] in the device's base frame B [N, N m]."""
@@ -123,7 +123,7 @@ class DeviceClient:
 class VirtualDevice:
     """Simulated device in a moving hand; `energy`: work done against the rendered force [J]."""
 
-    def __init__(self, hand_motion: HandMotion, grip: str = "medium") -> None:
+    def __init__(self, hand_motion: HandMotionFunction, grip: str = "medium") -> None:
         held, self._hand = GRIP_IMPEDANCES[grip], hand_motion
         self._mass, self._k, self._d = _VIRTUAL_MASS_KG + held.mass, held.stiffness, held.damping
         self.position, self.velocity = list(map(float, hand_motion(0.0)[0])), [0.0, 0.0, 0.0]
@@ -145,7 +145,7 @@ class VirtualDevice:
                 self.energy -= force[i] * h * v
 
 
-def tapping_motion(depth: float, *, hertz: float = 0.5) -> HandMotion:
+def tapping_motion(depth: float, *, hertz: float = 0.5) -> HandMotionFunction:
     """Return a hand motion that taps `hertz` times a second, from z = 10 mm to -`depth` [m]."""
     lift, hold = 0.01, 0.6
 
@@ -212,7 +212,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--depth", type=float, default=0.08, help="tapping depth of the virtual device [m]")
     add("--seconds", type=float, default=math.inf, help="duration [s] (default: no limit)")
     add("--no-observer", action="store_true", help="disable the passivity observer")
-    add("--json", type=Path, help="JSON file for the force delays, largest force and energy")
+    add("--json", type=Path, help="JSON file to write: force delay, largest force, energy")
     options = parser.parse_args(arguments)
     if options.json is not None:
         make_folder(options.json.parent)

@@ -18,7 +18,7 @@ from drake_teleop.common.numeric import Array
 
 COMMAND_TIMEOUT_S = 0.05  #: age of a command at which the force is zero [s]
 _FORCE_FADE_START_AGE_S = 0.02  # s
-_LIMIT_RISE_N_S = 100.0  # N/s, slew rate of the force limit after silence
+_RECOVERY_N_PER_S = 100.0  # N/s, slew rate of the force limit after silence
 _MAX_STORED_ENERGY_J, _STORED_ENERGY_KEPT_J = 0.3, 3e-5  # J
 _MAX_DAMPING_NS_M = 100.0  # N s/m
 
@@ -49,9 +49,9 @@ class DeviceGuard:
         self._position: Array | None = None
 
     def limit_wrench(
-        self, position: Sequence[float], wrench: Sequence[float], age: float, period: float
+        self, position: Sequence[float], wrench: Sequence[float], command_age: float, period: float
     ) -> tuple[float, ...]:
-        """Return `wrench` (6,) after all limits; `age` of the command, `period` of calls [s]."""
+        """Return `wrench` (6,) after all limits; `position` (3,) in B [m], times [s]."""
         x = np.array(position, dtype=float)
         motion = np.zeros(3) if self._position is None else x - self._position
         work = -float(self._force @ motion)
@@ -59,10 +59,10 @@ class DeviceGuard:
         self._stored_energy = min(self._stored_energy + work, _MAX_STORED_ENERGY_J)
         # Extrapolate the speed linearly, over a period of the same length.
         velocity = motion / period
-        next_motion = period * (2.0 * velocity - self._velocity)
+        next_step = period * (2.0 * velocity - self._velocity)
         self._position, self._velocity = x, velocity
 
-        share = self._update_limit_and_get_fade_factor(age, period)
+        share = self._restore_limit_and_get_fade_factor(command_age, period)
         force, torque = _zeros_if_any_not_finite(wrench[:3]), _zeros_if_any_not_finite(wrench[3:])
         limits = self._limits
         force = _limit_norm(share * force, min(limits.force, self._force_limit))
@@ -72,33 +72,32 @@ class DeviceGuard:
         if share == 0.0:  # the timeout overrides the slew limit
             force, torque = np.zeros((2, 3))
         elif self._observe:
-            force = _limit_norm(self._limit_force_by_energy(force, next_motion), limits.force)
+            force = _limit_norm(self._limit_force_by_energy(force, next_step), limits.force)
         self._force, self._torque = force, torque
         return tuple(np.concatenate([force, torque]).tolist())
 
     def reset_force_and_motion(self) -> None:
-        """Set the last force and velocity to zero, after a tick without a pose."""
         self._force, self._torque, self._velocity = np.zeros((3, 3))
         self._position = None
 
-    def _update_limit_and_get_fade_factor(self, age: float, period: float) -> float:
-        if not age < COMMAND_TIMEOUT_S:
+    def _restore_limit_and_get_fade_factor(self, command_age: float, period: float) -> float:
+        if not command_age < COMMAND_TIMEOUT_S:
             self._was_silent = True
         elif self._was_silent:
             self._was_silent, self._force_limit = False, 0.0
-        self._force_limit = min(self._force_limit + _LIMIT_RISE_N_S * period, self._limits.force)
-        share = (COMMAND_TIMEOUT_S - age) / (COMMAND_TIMEOUT_S - _FORCE_FADE_START_AGE_S)
-        return min(max(share, 0.0), 1.0) if age < COMMAND_TIMEOUT_S else 0.0
+        self._force_limit = min(self._force_limit + _RECOVERY_N_PER_S * period, self._limits.force)
+        share = (COMMAND_TIMEOUT_S - command_age) / (COMMAND_TIMEOUT_S - _FORCE_FADE_START_AGE_S)
+        return min(max(share, 0.0), 1.0) if command_age < COMMAND_TIMEOUT_S else 0.0
 
-    def _limit_force_by_energy(self, force: Array, next_motion: Array) -> Array:
-        distance, available = math.hypot(*next_motion), self._stored_energy - _STORED_ENERGY_KEPT_J
-        returned = float(force @ next_motion)
+    def _limit_force_by_energy(self, force: Array, next_step: Array) -> Array:
+        distance, available = math.hypot(*next_step), self._stored_energy - _STORED_ENERGY_KEPT_J
+        returned = float(force @ next_step)
         if returned <= available or distance < 1e-12 or not force.any():
             return force
         self.num_reduced_forces += 1
         force_along = returned / distance
         max_force = max(available / distance, -_MAX_DAMPING_NS_M * math.hypot(*self._velocity))
-        return force - max(force_along - max_force, 0.0) / distance * next_motion
+        return force - max(force_along - max_force, 0.0) / distance * next_step
 
 
 def _zeros_if_any_not_finite(a: Sequence[float]) -> Array:

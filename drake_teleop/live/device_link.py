@@ -22,13 +22,13 @@ from drake_teleop.robots.udp import LOCALHOST, host_and_port, open_udp_receiver
 
 _CLIENT_EXIT_TIMEOUT_S = 2.0  # s
 _MAX_PACKETS_PER_POLL = 256  # packets per poll
-_NUM_PACKETS_OF_LINK_STATISTICS = 2000  # packets in the statistics of lateness
+_LINK_STATISTICS_PACKETS = 2000  # packets in the statistics of lateness
 # Duration of the open clutch after silence, while the hand moves to the device's pose [s].
 _OPEN_CLUTCH_TIME_S = 0.05
 
 
 class DeviceLink:
-    """UDP link to one device client on this machine; another may follow after 50 ms of silence.
+    """UDP link to one device client on this machine; 50 ms of silence admit another client.
 
     An address haply://HOST:PORT also starts the client.
 
@@ -58,8 +58,8 @@ class DeviceLink:
         self._last_arrival, self._connected_at, self._polled_at = -np.inf, np.inf, 0.0
         self._origin: DeviceState | None = None
         # Arrival minus the device's time; the minimum is the clock offset.
-        self._latencies: deque[float] = deque(maxlen=_NUM_PACKETS_OF_LINK_STATISTICS)
-        self._force_ages: deque[float] = deque(maxlen=_NUM_PACKETS_OF_LINK_STATISTICS)
+        self._latencies: deque[float] = deque(maxlen=_LINK_STATISTICS_PACKETS)
+        self._force_ages: deque[float] = deque(maxlen=_LINK_STATISTICS_PACKETS)
         self._client: subprocess.Popen[bytes] | None = None
         if kind == "haply":
             station = f"udp://{LOCALHOST}:{self.port}"
@@ -115,7 +115,7 @@ class DeviceLink:
         self._origin, self._connected_at = self._state, now
 
     def hand_inputs(self, now: float) -> Mapping[str, float]:
-        """Return `Inputs` values for the device's motion from its origin; held = 0 if silent."""
+        """Return inputs x ... rz and held for the device's displacement; held = 0 if silent."""
         state = self.receive_state(now)
         if state is None or self._origin is None:
             return {"held": 0, "clutch": 0}
@@ -140,11 +140,11 @@ class DeviceLink:
 
     def status_text(self) -> str:
         if not self.refused:
-            return self._describe_link()
+            return self._connection_text()
         reason = f"the last one {self.refusal}"
-        return f"{self._describe_link()}. Refused packets: {self.refused}; {reason}"
+        return f"{self._connection_text()}. Refused packets: {self.refused}; {reason}"
 
-    def _describe_link(self) -> str:
+    def _connection_text(self) -> str:
         if self.is_device_silent(self._polled_at):
             what = "The device is silent: no force" if self._peer else "No device yet"
             return f"{what} (udp://127.0.0.1:{self.port})"

@@ -23,7 +23,7 @@ class DeviceState(NamedTuple):
     """State of a haptic device, with its packet number and time on the device's clock [s].
 
     Attributes:
-        position: p_BE [m].
+        position: p_BE of the end effector E in the base frame B [m].
         quaternion_wxyz: (4,) unit quaternion of R_BE.
         flags: 0 or `CLUTCH_OPEN_FLAG`.
         force_age_s: age of the position that caused the displayed force [s]; 0: no force.
@@ -38,7 +38,7 @@ class DeviceState(NamedTuple):
 
 
 class ForceCommand(NamedTuple):
-    """Wrench [f; tau] in B [N, N m], with number and time of the answered state."""
+    """Wrench [f; tau] in the device's base frame [N, N m]; number and time of answered state."""
 
     number: int
     t: float

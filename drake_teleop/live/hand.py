@@ -53,7 +53,7 @@ _INVALID_WRENCH_FAULT_NUMBER = float(Fault.HAND_WRENCH)
 
 @njit(cache=True)
 def _intended_motion_into(path, time, pose, out):
-    """Write intended X_BE (7,), twist (6,), acceleration (3,) on the path at a time to `out`."""
+    """Write intended X_BE (7,), twist (6,), acceleration (3,) to `out`; `pose` if not held."""
     if path[_IS_HELD_INDEX] < 0.5:
         out[:7] = pose
         out[7:] = 0.0
@@ -110,8 +110,8 @@ def _rotation_vector_rate(r, omega):
 
 
 @njit(cache=True)
-def _plan_hand_path_into(path, time, motion, target, pole):
-    path[_IS_HELD_INDEX], path[_START_TIME_INDEX], path[_POLE_INDEX] = 1.0, time, pole
+def _plan_hand_path_into(path, time, motion, target, pole_rad_s):
+    path[_IS_HELD_INDEX], path[_START_TIME_INDEX], path[_POLE_INDEX] = 1.0, time, pole_rad_s
     vectors.copy_into(path, _TARGET_POSE_INDEX, target, 0, 7)
     rotation = vectors.quaternion_logarithm(
         vectors.quaternion_product(motion, vectors.conjugate_quaternion(target))
@@ -125,11 +125,11 @@ def _plan_hand_path_into(path, time, motion, target, pole):
 
 
 @njit(cache=True, omits_reference_counting=True)
-def _live_hand_wrench_into(path, time, impedance, mass, pose, twist, intention, wrench):
-    _intended_motion_into(path, time, pose, intention)
+def _live_hand_wrench_into(path, time, impedance, mass, pose, twist, intended, out):
+    _intended_motion_into(path, time, pose, intended)
     for k in range(3):
-        intention[4 + k] += mass / impedance[0] * intention[13 + k]
-    operator.hand_wrench_into(impedance, intention[:7], intention[7:13], pose, twist, wrench)
+        intended[4 + k] += mass / impedance[0] * intended[13 + k]
+    operator.hand_wrench_into(impedance, intended[:7], intended[7:13], pose, twist, out)
 
 
 class LiveHand(operator.Operator):
@@ -170,7 +170,7 @@ class LiveHand(operator.Operator):
     def KeepWrench(
         self, context: Context, before: operator.HandImpedance, after: operator.HandImpedance
     ) -> None:
-        """Shift the intended motion so that changing the impedance causes no step of the wrench."""
+        """Shift the intended motion so that replacing `before` by `after` keeps the wrench."""
         path = context.get_mutable_numeric_parameter(self._path).CopyToVector()
         if path[_IS_HELD_INDEX] < 0.5:
             return
@@ -210,7 +210,7 @@ class LiveHand(operator.Operator):
 
 
 def MakeLiveMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
-    """Return the master side with a `LiveHand` and, if `cross_fade`, a block `CrossFade`."""
+    """Return a master side with simulated hand; `cross_fade`: with a block `CrossFade`."""
     builder = DiagramBuilder()
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     hand = LiveHand(scenario.operator, start)
@@ -235,7 +235,7 @@ def _pose_and_twist_on_path_into(path, time, out):
 
 
 @njit(cache=True)
-def _update_displayed_wrench(wrench, is_device_held, period, limits, last_state, state):
+def _limit_device_wrench_into(wrench, is_device_held, period, limits, last_state, state):
     fault = 0.0
     if not are_valid_port_values(wrench):
         fault = _INVALID_WRENCH_FAULT_NUMBER
@@ -256,9 +256,9 @@ def _update_displayed_wrench(wrench, is_device_held, period, limits, last_state,
     state[_FAULT_INDEX], state[_ALLOWED_SHARE_INDEX] = fault, allowed
 
 
-def _copy_state(part: slice, sign: float = 1.0) -> Callable[[Context, BasicVector], None]:
+def _copy_state(state_slice: slice, factor: float = 1.0) -> Callable[[Context, BasicVector], None]:
     def copy(context: Context, output: BasicVector) -> None:
-        output.SetFromVector(sign * context.get_discrete_state_vector().value()[part])
+        output.SetFromVector(factor * context.get_discrete_state_vector().value()[state_slice])
 
     return copy
 
@@ -301,7 +301,7 @@ class ExternalMaster(framework.LeafSystem):
             ("force_to_master", 6, _copy_state(slice(_FAULT_INDEX)), displayed),
             ("fault_at_hand", 1, _copy_state(slice(_FAULT_INDEX, _ALLOWED_SHARE_INDEX)), displayed),
             ("displayed_and_fault", 7, _copy_state(slice(_ALLOWED_SHARE_INDEX)), displayed),
-            ("hand_wrench_E", 6, _copy_state(slice(_FAULT_INDEX), sign=-1.0), displayed),
+            ("hand_wrench_E", 6, _copy_state(slice(_FAULT_INDEX), factor=-1.0), displayed),
         ):
             self.DeclareVectorOutputPort(name, size, calc, needed)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_display)
@@ -343,11 +343,11 @@ class ExternalMaster(framework.LeafSystem):
         held = context.get_numeric_parameter(self._path).value()[_IS_HELD_INDEX] > 0.5
         last, new = context.get_discrete_state_vector().value(), discrete_state.get_mutable_value(0)
         wrench = self._command.Eval(context)
-        _update_displayed_wrench(wrench, held, self._period, self._limits, last, new)
+        _limit_device_wrench_into(wrench, held, self._period, self._limits, last, new)
 
 
 def MakeExternalMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
-    """Return the master side of a real device, with the ports of `MakeLiveMasterSide`."""
+    """Return the master side of a real device; `cross_fade`: with a block `CrossFade`."""
     parameters = scenario.master.device(0.0, 0.0).parameters
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     limits = np.array([parameters.peak_force, parameters.peak_torque.max()])

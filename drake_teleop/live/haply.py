@@ -17,7 +17,7 @@ from drake_teleop.live.device_packets import CLUTCH_OPEN_FLAG, DeviceState, vali
 
 _MAX_MESSAGE_BYTES, _RECEIVE_TIMEOUT_S = 65536, 0.5  # bytes of a message, s
 _START_SERVICE_REMEDY = "start Haply's Inverse Service"
-_VERSE_GRIP_KEYS = ("wireless_verse_grip", "verse_grip", "wired_verse_grip", "custom_verse_grip")
+_GRIP_JSON_KEYS = ("wireless_verse_grip", "verse_grip", "wired_verse_grip", "custom_verse_grip")
 
 
 def parse_device_message(text: Any) -> tuple[str, DeviceState] | None:
@@ -29,7 +29,7 @@ def parse_device_message(text: Any) -> tuple[str, DeviceState] | None:
         cursor = content["inverse3"][0]
         place, name = cursor["state"]["cursor_position"], cursor["device_id"]
         x, y, z = (_require_finite_float(place[axis]) for axis in "xyz")
-        grip: Any = next((content[k][0]["state"] for k in _VERSE_GRIP_KEYS if content.get(k)), {})
+        grip: Any = next((content[k][0]["state"] for k in _GRIP_JSON_KEYS if content.get(k)), {})
         turn = grip.get("orientation") or {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
         w, i, j, k = (_require_finite_float(turn[axis]) for axis in "wxyz")
         pressed = (grip.get("buttons") or {}).get("a") is True

@@ -23,9 +23,9 @@ from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.sensor.presets import PRESETS as SENSOR_PRESETS
 
-AS_IN_SCENARIO_NAME = "as in the scenario"
-NETWORK_NAMES = (AS_IN_SCENARIO_NAME, *NETWORK_PRESETS, "custom")
-SENSOR_NAMES = (AS_IN_SCENARIO_NAME, *SENSOR_PRESETS)
+UNCHANGED_CHOICE = "as in the scenario"
+NETWORK_NAMES = (UNCHANGED_CHOICE, *NETWORK_PRESETS, "custom")
+SENSOR_NAMES = (UNCHANGED_CHOICE, *SENSOR_PRESETS)
 
 #: Length of a slice [ms]; inputs change between slices.
 SLICE_MS = 5
@@ -58,7 +58,7 @@ def _integer_field_with_range(default: int, low: int, high: int) -> Any:
 
 @dataclass(frozen=True)
 class Inputs:
-    """Inputs, all integers, that the driver (the page that moves the hand) may change.
+    """Integer inputs from the page that moves the hand.
 
     Attributes:
         x, y, z: intended displacement of the stylus in B [10 um].
@@ -71,7 +71,7 @@ class Inputs:
         gamma: scale of the contact wrench [%].
         force_scale: scale from slave to master force [1e-5].
         network, method, grip, sensor: index into `choice_names()`.
-        delay, jitter, loss: of the network "custom" [0.1 ms, %, 0.1 %].
+        delay, jitter, loss: of the network "custom" [0.1 ms, % of the delay, 0.1 %].
         object: 1 with a gripped object.
         detection: 1 with contact detection.
     """
@@ -139,19 +139,16 @@ class Inputs:
     def channel_and_method_inputs(self) -> tuple[int, ...]:
         return self.station_choices[:2] + self.station_choices[6:]
 
-    def intended_pose(self, start: Array) -> Array | None:
-        """Return the intended pose X_BE (7,); None if the hand lets go.
-
-        `start` (3,) is p_BE at zero inputs.
-        """
+    def intended_pose(self, p_BE_start: Array) -> Array | None:
+        """Return the intended pose X_BE (7,), from p_BE at zero inputs; None: the hand lets go."""
         if not self.held:
             return None
         q = quaternion_exponential(tuple(INPUT_UNIT_RAD * r for r in (self.rx, self.ry, self.rz)))
-        return np.concatenate([q, start + INPUT_UNIT_M * np.array([self.x, self.y, self.z])])
+        return np.concatenate([q, p_BE_start + INPUT_UNIT_M * np.array([self.x, self.y, self.z])])
 
-    def with_hand_at_pose(self, pose: Array, start: Array) -> Inputs:
+    def with_hand_at_pose(self, pose: Array, p_BE_start: Array) -> Inputs:
         """Return the inputs that hold the stylus at the pose X_BE (7,)."""
-        return self.with_changes(inputs_at_displacement(pose[4:] - start, tuple(pose[:4])))
+        return self.with_changes(inputs_at_displacement(pose[4:] - p_BE_start, tuple(pose[:4])))
 
     @property
     def force_scales(self) -> dict[str, Any]:
@@ -181,7 +178,7 @@ def input_range(name: str) -> tuple[int, int]:
 def inputs_at_displacement(
     displacement: Sequence[float] | Array, rotation: Any
 ) -> dict[str, float]:
-    """Return held, x ... rz of a hand at a displacement, as floats in units of `Inputs`.
+    """Return held, x ... rz of a hand at a displacement, in 10 um and 0.1 mrad.
 
     `displacement` (3,) is in B [m], `rotation` a quaternion [w, x, y, z].
     """
@@ -191,10 +188,10 @@ def inputs_at_displacement(
     return values
 
 
-_CURRENT_VERSIONS = {"drake_teleop": __version__}
+_PROGRAM_VERSIONS = {"drake_teleop": __version__}
 
 
-def csv_header(versions: Mapping[str, str] = _CURRENT_VERSIONS) -> str:
+def csv_header(versions: Mapping[str, str] = _PROGRAM_VERSIONS) -> str:
     comment = ", ".join(f"{name} {version}" for name, version in versions.items())
     return f"# {comment}\n{','.join(_CSV_COLUMNS)}\n"
 
@@ -205,7 +202,7 @@ def csv_row(ms: int, inputs: Inputs) -> str:
 
 
 def read_inputs(
-    path: Path, versions: Mapping[str, str] = _CURRENT_VERSIONS
+    path: Path, versions: Mapping[str, str] = _PROGRAM_VERSIONS
 ) -> list[tuple[int, Inputs]]:
     """Return the recorded changes as (time [ms], inputs); the time of the last one is the end.
 
@@ -214,7 +211,7 @@ def read_inputs(
     complete = read_text(path).rpartition("\n")[0]
     lines = [line.split(",") for line in complete.split("\n")]
     if tuple(lines[0]) == _CSV_COLUMNS:
-        raise _repeat_error("does not contain the version of drake_teleop that wrote it", path)
+        raise _unrepeatable_error("lacks the version of drake_teleop that wrote it", path)
     if tuple(lines[1:2]) != (list(_CSV_COLUMNS),) or not complete.startswith("# "):
         what = "does not contain the inputs of a recorded live session"
         remedy = f"use the columns {', '.join(_CSV_COLUMNS)}"
@@ -224,7 +221,7 @@ def read_inputs(
         if recorded.get(name) != value:
             what = f"was recorded with {name} {recorded.get(name, 'unknown')}, not with {value}"
             changed = "the models or other files that its scenario names have changed"
-            raise _repeat_error(changed if name == "files" else what, path)
+            raise _unrepeatable_error(changed if name == "files" else what, path)
     changes = list(_parse_csv_rows(lines[2:], path))
     if not changes or changes[-1][0] == 0:
         remedy = "record the session again"
@@ -232,7 +229,7 @@ def read_inputs(
     return changes
 
 
-def _repeat_error(what: str, path: Path) -> DrakeTeleopError:
+def _unrepeatable_error(what: str, path: Path) -> DrakeTeleopError:
     folder = shlex.quote(str(path.parent))
     remedy = f"it cannot be repeated exactly; to see its log, run drake-teleop replay {folder}"
     return DrakeTeleopError(what, where=str(path), remedy=remedy)
@@ -249,7 +246,7 @@ def _parse_csv_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, I
             if line[column] in choices.get(name, ()):
                 line[column] = str(choices[name].index(line[column]))
             elif name in choices:
-                raise _repeat_error(f"has the unknown {name} {line[column]!r}", path)
+                raise _unrepeatable_error(f"has the unknown {name} {line[column]!r}", path)
         try:
             ms, *values = map(int, line)
         except ValueError:

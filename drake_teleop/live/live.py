@@ -21,7 +21,7 @@ from drake_teleop.live import inputs as live_inputs
 from drake_teleop.live.cockpit import PageValueCalculator
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.hand import POSE_PERIOD_MS
-from drake_teleop.live.motion_limits import MotionLimiter, RateInputs
+from drake_teleop.live.motion_limits import InputRateIntegrator, MotionLimiter
 from drake_teleop.live.scenarios import SCENE_NAMES
 from drake_teleop.live.session import Session
 from drake_teleop.station.scenario import Scenario
@@ -33,7 +33,7 @@ SceneFunction = Callable[[dict[str, np.ndarray]], dict[str, Any]]
 FRAME_PERIOD_S = 1 / 60
 _MIN_TIME_BETWEEN_PAGE_FRAMES_S = 0.25 * FRAME_PERIOD_S  # s, shortest time between two frames
 #: Smallest contact force at the hand that a gamepad displays [N].
-MIN_DISPLAYED_TOUCH_FORCE_N = 0.12
+MIN_GAMEPAD_TOUCH_FORCE_N = 0.12
 # Time without a driver until the simulation stops [s]; maximum number of slices between two polls
 # of messages.
 _MAX_UNDRIVEN_S, _MAX_SLICES_PER_TICK = 0.25, 4
@@ -46,7 +46,7 @@ MAX_MESSAGE_BYTES = 4096
 #: Largest clock time per simulated time.
 MAX_SLOWDOWN = 20.0
 #: Lateness above which lost time is not caught up [s].
-_MAX_SLICE_DELAY_TO_CATCH_UP_S = 0.1
+_MAX_RECOVERABLE_LATENESS_S = 0.1
 _NUM_SLICES_OF_TIMING_STATISTICS = 400  # slices
 
 
@@ -74,7 +74,7 @@ class SliceSchedule:
 
     def begin_slice(self, now: float) -> None:
         late = now - self._due
-        if late > _MAX_SLICE_DELAY_TO_CATCH_UP_S:
+        if late > _MAX_RECOVERABLE_LATENESS_S:
             self.lost_time_s += late
             self._due = now
         self._lateness.append(late)
@@ -83,7 +83,7 @@ class SliceSchedule:
 
     @property
     def real_time_factor(self) -> float:
-        """Ratio of simulated to clock time of the last 400 slices; 0 before the second one."""
+        """Ratio of simulated to clock time of the last 400 slices; 0 before the second slice."""
         if len(self._starts) < 2 or self._starts[-1] <= self._starts[0]:
             return 0.0
         return (len(self._starts) - 1) * self._slice / (self._starts[-1] - self._starts[0])
@@ -95,7 +95,6 @@ class SliceSchedule:
 
 @contextmanager
 def without_garbage_collection() -> Iterator[None]:
-    """Disable Python's garbage collector, which would delay slices."""
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -112,7 +111,7 @@ class Live:
     Attributes:
         refused: number of invalid messages.
         stop_reason: failure that stops the simulation, or "".
-        requested_scene: scene requested by a page, or ""; the simulation waits for `change_scene`.
+        requested_scene: scene requested by a page, or "".
         recorded: folders of completed records.
 
     Args:
@@ -162,7 +161,7 @@ class Live:
         self._cockpit, self.stop_reason = PageValueCalculator(self._scenario), ""
         self._asleep = self._driver is None
         self._refusal, self._touched = "", False
-        self._requested, self._rates = self._session.inputs, RateInputs()
+        self._requested, self._rates = self._session.inputs, InputRateIntegrator()
         self._last_target = self._requested.hand_pose_and_held
         self._last_frame: dict[str, Any] = {}
         self.pace.restart(now)
@@ -170,7 +169,7 @@ class Live:
     def change_scene(
         self, scenario: Scenario, load: IdentifiedLoad | None, show: SceneFunction, now: float
     ) -> None:
-        """Complete the record and start a new session with the requested scene at `now` [s]."""
+        """Complete the record and start a session with the requested scene."""
         self._scenario, self._load, self._scene_part = scenario, load, show
         self.scene, self.requested_scene = self.requested_scene, ""
         self._restart_session(now)
@@ -194,7 +193,7 @@ class Live:
             "ranges": {name: live_inputs.input_range(name) for name in live_inputs.INPUT_RANGES},
             "names": live_inputs.choice_names(),
             "object": self._scenario.force_scaling.gripper_phi is not None,
-            "touch": MIN_DISPLAYED_TOUCH_FORCE_N,
+            "touch": MIN_GAMEPAD_TOUCH_FORCE_N,
             "known": self._load is not None,
             "noise": self._load is not None and self._load.noise_floor is not None,
             "scale": scaling.translation_scale,
@@ -213,7 +212,7 @@ class Live:
             self._driver, self._idle_since = None, now
             changes = {"held": 0, "clutch": 0} if self._link is None else {"clutch": 1}
             self._requested = self._requested.with_changes(changes)
-            self._rates = RateInputs()
+            self._rates = InputRateIntegrator()
 
     def handle_message(self, client: int, text: Any, now: float) -> None:
         message = parse_message(text)
@@ -228,7 +227,7 @@ class Live:
             if not live_inputs.STATION_SWAP_INPUTS.isdisjoint(message["set"]):
                 self._refusal = ""
             self._requested = self._requested.with_changes(message["set"])
-            self._rates = RateInputs()
+            self._rates = InputRateIntegrator()
         if "rates" in message:
             self._requested = self._rates.set_rates(message["rates"], self._requested, now)
         if "slow" in message:
@@ -245,7 +244,7 @@ class Live:
     def _set_driving_page(self, client: int, now: float) -> None:
         self._driver = client
         self._requested = self._session.inputs_at_stylus().with_changes({"clutch": 1})
-        self._rates = RateInputs()
+        self._rates = InputRateIntegrator()
         if self._asleep:
             self.pace.restart(now)
         self._asleep = False
@@ -272,7 +271,7 @@ class Live:
             self.pace.begin_slice(now)
             self._simulate_time_slice(now)
         now = clock()
-        self._resume_if_device_sends(now)
+        self._resume_simulation_if_device_sends(now)
         if self._driver is None and not self._asleep and now - self._idle_since >= _MAX_UNDRIVEN_S:
             self._asleep = True
             self._run_and_stop_session_on_failure(self._session.write_record_and_log)
@@ -285,7 +284,7 @@ class Live:
         self._last_frame_at, self._show_now = now, False
         return self.frame()
 
-    def _resume_if_device_sends(self, now: float) -> None:
+    def _resume_simulation_if_device_sends(self, now: float) -> None:
         if self._link is None or self._link.receive_state(now) is None:
             return
         self._idle_since = now
@@ -319,7 +318,7 @@ class Live:
                 self._requested = self._requested.with_changes(removed)
         if not self.stop_reason:
             self._run_and_stop_session_on_failure(lambda: self._session.advance(self._slice_ms))
-            pressed = self._session.contact_force() > MIN_DISPLAYED_TOUCH_FORCE_N
+            pressed = self._session.contact_force() > MIN_GAMEPAD_TOUCH_FORCE_N
             self._show_now |= pressed and not self._touched
             self._touched = pressed
         if self._link is not None and not self.stop_reason:
@@ -392,7 +391,6 @@ def _unused_folder_path(folder: Path) -> Path:
 
 
 def parse_message(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests in a message of a page, or None."""
     if not isinstance(text, str) or len(text) > MAX_MESSAGE_BYTES:
         return None
     try:

@@ -16,7 +16,7 @@ _LEAD_TIMES_S = dict.fromkeys("xyz", TARGET_LEAD_TIME_S) | dict.fromkeys(("rx", 
 _TOOL_TRANSLATION_LIMITS, _TOOL_ROTATION_LIMITS = (0.8, 20.0), (8.0, 250.0)
 
 
-class RateInputs:
+class InputRateIntegrator:
     """Integrator of the rates of inputs (from keys, sticks) in simulated time."""
 
     def __init__(self) -> None:
@@ -25,7 +25,7 @@ class RateInputs:
         self._end_time = 0.0
 
     def set_rates(self, rates: Mapping[str, float], inputs: Inputs, now: float) -> Inputs:
-        """Set new rates by input name [input units/s] for 1 s; return the inputs."""
+        """Set rates by input name [input units/s], 0 after 1 s; return the present inputs."""
         if not self._rates:
             self._at = {name: float(getattr(inputs, name)) for name in _LEAD_TIMES_S}
         self._rates = {name: rate for name, rate in rates.items() if rate and name in _LEAD_TIMES_S}

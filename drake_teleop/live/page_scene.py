@@ -23,7 +23,7 @@ _SCENE_DISABLING_EXCEPTIONS = (Exception, SystemExit)  # SystemExit is a failed 
 
 # Commands in base64 and their files in the static page of Meshcat.
 _MESHCAT_COMMAND_PATTERN = re.compile(r'fetch\("data:application/octet-binary;base64,([^"]*)"\)')
-_ASSET_PATTERN = re.compile(r'^casAssets\["([^"]*)"\] = "([^"]*)";$', re.M)
+_FILE_PATTERN = re.compile(r'^casAssets\["([^"]*)"\] = "([^"]*)";$', re.M)
 
 
 class PageScene:
@@ -48,7 +48,7 @@ class PageScene:
             self._report_scene_failure(error)
 
     def scene_values(self, rows: LogRows) -> dict[str, Any]:
-        """Return the frame's part for the last row: 4x4 poses (column-major) and sizes by path."""
+        """Return 4x4 poses (column-major) and sizes of 3D objects by path, for the last row."""
         moves = {} if self.failure else self._scene_poses_and_sizes_of_last_row(rows)
         return {"view": self.name, "no_view": self.failure, "moves": moves}
 
@@ -61,11 +61,11 @@ class PageScene:
             if all(np.isfinite(values[-1]).all() for values in rows.values()):
                 self._report_scene_failure(error)
             return {}
-        return moves.rounded_changes()
+        return moves.rounded_poses_and_sizes()
 
     def _report_scene_failure(self, error: BaseException) -> None:
         self.failure = to_one_line(f"no 3D scene: {error}")
-        print(f"warning: {self.failure}; the drive continues without it", file=sys.stderr)
+        print(f"warning: {self.failure}; the session continues without 3D", file=sys.stderr)
 
 
 class _SceneChangeRecorder:
@@ -79,7 +79,7 @@ class _SceneChangeRecorder:
     def SetProperty(self, path: str, property: str, value: list[float], time: float) -> None:
         self._sizes[path] = [round(x, 4) for x in value]
 
-    def rounded_changes(self) -> dict[str, Any]:
+    def rounded_poses_and_sizes(self) -> dict[str, Any]:
         matrices = np.array([*self._poses.values()]).round(5)
         if not np.isfinite(matrices).all():
             return {}
@@ -91,4 +91,4 @@ def _scene_objects_json(html: str) -> bytes:
     commands = _MESHCAT_COMMAND_PATTERN.findall(html)
     if not commands:
         raise ValueError("the static page of Drake's Meshcat has an unknown format")
-    return json.dumps({"commands": commands, "files": dict(_ASSET_PATTERN.findall(html))}).encode()
+    return json.dumps({"commands": commands, "files": dict(_FILE_PATTERN.findall(html))}).encode()

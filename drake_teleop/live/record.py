@@ -27,7 +27,7 @@ from drake_teleop.station.simulation import LogOnDisk
 
 LOAD_FILE, SCENARIO_FILE = "load.npz", "scenario.yaml"
 #: Marker file: the positions in the inputs are those of a haptic device.
-DEVICE_MARKER_FILE = "device.txt"
+HAPTIC_DEVICE_FILE = "device.txt"
 
 
 def versions_and_file_digest(scenario: Scenario) -> dict[str, str]:
@@ -58,7 +58,7 @@ class SessionRecord:
         try:
             write_scenario(folder / SCENARIO_FILE, scenario)
             if device:
-                write_text(folder / DEVICE_MARKER_FILE, "inputs.csv: x to rz are device poses.\n")
+                write_text(folder / HAPTIC_DEVICE_FILE, "A haptic device moved the hand.\n")
             if load is not None:
                 write_cached_load(folder / LOAD_FILE, load)
             self._append_line(csv_header(versions_and_file_digest(scenario)))
@@ -80,7 +80,7 @@ class SessionRecord:
             self._file.flush()
 
     def close(self, ms: int, inputs: Inputs) -> None:
-        """Write the end time [ms] and close the files; remove an empty record."""
+        """Write the end time [ms] and close the files; remove a record of 0 ms."""
         if not ms:
             return self._remove_record_files()
         self.write(ms, inputs)
@@ -91,7 +91,7 @@ class SessionRecord:
         with suppress(OSError):
             self._file.close()
         with suppress(OSError):  # the folder contains other files
-            for name in (DRIVE_INPUTS_FILE_NAME, SCENARIO_FILE, LOAD_FILE, DEVICE_MARKER_FILE):
+            for name in (DRIVE_INPUTS_FILE_NAME, SCENARIO_FILE, LOAD_FILE, HAPTIC_DEVICE_FILE):
                 (self._folder / name).unlink(missing_ok=True)
             self._folder.rmdir()
 

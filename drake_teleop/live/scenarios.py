@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.identified_load import IdentifiedLoad
-from drake_teleop.live.inputs import AS_IN_SCENARIO_NAME, NETWORK_NAMES, SENSOR_NAMES, Inputs
+from drake_teleop.live.inputs import NETWORK_NAMES, SENSOR_NAMES, UNCHANGED_CHOICE, Inputs
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import longest_delay
 from drake_teleop.station.environment.solids import Wall
@@ -23,7 +23,7 @@ from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.slave_config import Payload
 
 #: Gripped object, if the scenario has no payload.
-DEFAULT_GRIPPED_OBJECT = Payload(mass=0.8)
+DEFAULT_GRIPPED_PAYLOAD = Payload(mass=0.8)
 #: Duration of the cross-fade to the rendered wrench of a new station [s].
 CROSS_FADE_S = 0.25
 # Smallest rotational impedance if the scenario does not use `wave` [N m s/rad]. The friction of a
@@ -37,7 +37,7 @@ SCENE_NAMES = ("own", *_SHIPPED_SCENES)
 
 
 def live_scenario(scenario: Scenario) -> Scenario:
-    """Remove intended motion, task, settling and end by faults; set Runge-Kutta integration."""
+    """Return the scenario without scripted motion, settling and end by faults, for a live hand."""
     return replace(
         scenario,
         operator__intent=[],
@@ -85,7 +85,7 @@ def scenario_of_inputs(scenario: Scenario, load: IdentifiedLoad | None, inputs: 
         delay, jitter = _DELAY_INPUT_UNIT_S * inputs.delay, _JITTER_INPUT_UNIT * inputs.jitter
         loss = _LOSS_INPUT_UNIT * inputs.loss
         changes["channel"] = Channel(delay=delay, jitter=jitter, distribution="gamma", loss=loss)
-    elif name != AS_IN_SCENARIO_NAME:
+    elif name != UNCHANGED_CHOICE:
         changes["channel"] = Channel(network=name)
     if inputs.sensor:
         changes["wrist_sensor"] = SENSOR_PRESETS[SENSOR_NAMES[inputs.sensor]]
@@ -96,28 +96,28 @@ def scenario_of_inputs(scenario: Scenario, load: IdentifiedLoad | None, inputs: 
         changes["contact_detection"] = ContactDetectionConfig()
     has_payload = scenario.slave.payload.mass > 0.0
     if inputs.object != has_payload:
-        mass = DEFAULT_GRIPPED_OBJECT.mass if inputs.object else 0.0
-        changes["slave__payload"] = dataclasses.replace(DEFAULT_GRIPPED_OBJECT, mass=mass)
+        mass = DEFAULT_GRIPPED_PAYLOAD.mass if inputs.object else 0.0
+        changes["slave__payload"] = dataclasses.replace(DEFAULT_GRIPPED_PAYLOAD, mass=mass)
     changed = replace(scenario, **changes)
     if inputs.object and load is not None and scenario.force_scaling.gripper_phi is None:
-        gripper = load.identification.phi - has_payload * _payload_phi(changed)
+        gripper = load.identification.phi - has_payload * _inertial_parameters_of_payload(changed)
         changed = replace(changed, force_scaling__gripper_phi=gripper.tolist())
     return changed
 
 
-def _payload_phi(scenario: Scenario) -> Array:
+def _inertial_parameters_of_payload(scenario: Scenario) -> Array:
     payload = NominalSlave(scenario.slave).arm.phi_load
     empty = replace(scenario, slave__payload=Payload(mass=0.0))
     return payload - NominalSlave(empty.slave).arm.phi_load
 
 
-def adapt_estimate(before: Scenario, load: IdentifiedLoad | None, after: Scenario) -> Array | None:
-    """Return the estimate (16,) of `load` in `before`, for the payload and sensor of `after`."""
+def adapt_load_estimate(old: Scenario, load: IdentifiedLoad | None, new: Scenario) -> Array | None:
+    """Return [offsets; phi] (16,) of `load`, adapted from scenario `old` to the load of `new`."""
     if load is None:
         return None
     estimate = load.estimate.copy()
-    estimate[:6] += _sensor_wrench_offset(after) - _sensor_wrench_offset(before)
-    arms = (NominalSlave(scenario.slave).arm for scenario in (after, before))
+    estimate[:6] += _sensor_wrench_offset(new) - _sensor_wrench_offset(old)
+    arms = (NominalSlave(scenario.slave).arm for scenario in (new, old))
     estimate[6:] += np.subtract(*(arm.phi_load for arm in arms))
     return estimate
 
@@ -128,7 +128,7 @@ def _sensor_wrench_offset(scenario: Scenario) -> Array:
 
 
 def channel_fill_time_s(scenario: Scenario) -> float:
-    """Return the longest round trip of the channel plus its resume time [s]; 0: no channel."""
+    """Return the longest round trip plus the time until transmission resumes [s]."""
     if scenario.has_no_network_or_passivity:
         return 0.0
     return RESUME_TIME_S + sum(map(longest_delay, scenario.channel.networks_of_directions()))

@@ -54,7 +54,7 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
 _LOOPBACK_ADDRESS = "127.0.0.1"
 _MAX_CONNECTED_PAGES = 8
 # Iterations of asyncio's loop from a readable socket to a handled message.
-_ASYNCIO_ITERATIONS_PER_MESSAGE = 3
+_EVENT_LOOP_TURNS_TO_RECEIVE = 3
 _MAX_UNSENT_BYTES_OF_PAGE = 2**18  # unsent bytes above which a slow page misses frames
 # Timeouts of the clients and of the drive's thread [s].
 _PAGE_CLOSE_TIMEOUT_S, _THREAD_TIMEOUT_S = 1.0, 4.0
@@ -156,7 +156,7 @@ class LiveDrive:
                     thread.join(rest)
         if any(thread.is_alive() for thread in self._threads):
             lost = "; its record may lack two seconds" if self._threads[0].is_alive() else ""
-            _print_to_stderr(f"error: the drive did not end within {_THREAD_TIMEOUT_S:g} s{lost}")
+            _print_to_stderr(f"error: the session did not end within {_THREAD_TIMEOUT_S:g} s{lost}")
             sys.stdout.flush()
             os._exit(2)
 
@@ -227,7 +227,7 @@ class LiveDrive:
                     broadcast(ready, json.dumps({"frame": frame}))
                 if self._link is not None and self._link.refusal != refusal:
                     refusal = self._link.refusal
-                    _print_to_stderr(f"a packet of the device was refused: it {refusal}")
+                    _print_to_stderr(f"a packet of the device was refused because it {refusal}")
                 await self._sleep_until_next_slice_or_frame()
 
     async def _sleep_until_next_slice_or_frame(self) -> None:
@@ -235,7 +235,7 @@ class LiveDrive:
         if rest > 0:
             await asyncio.sleep(rest)
         time.sleep(self._live.time_to_next_tick(time.perf_counter()))
-        for _ in range(_ASYNCIO_ITERATIONS_PER_MESSAGE):
+        for _ in range(_EVENT_LOOP_TURNS_TO_RECEIVE):
             await asyncio.sleep(0)
 
     async def _identify_load_and_change_scene(self) -> None:
@@ -245,7 +245,7 @@ class LiveDrive:
 
         def identify() -> None:
             try:
-                found.set_result(_identify_load(view.scenario, self._start_stoppable_stage))
+                found.set_result(_identify_load(view.scenario, self._start_interruptible_stage))
             except Exception as error:
                 found.set_exception(error)
 
@@ -263,7 +263,7 @@ class LiveDrive:
             with contextlib.suppress(ConnectionClosed):
                 await page.send(self._hello_message_json(page))
 
-    def _start_stoppable_stage(self, name: str) -> UpdateProgress:
+    def _start_interruptible_stage(self, name: str) -> UpdateProgress:
         def progress(fraction: float, words: str = "") -> None:
             if self._stop.is_set():
                 raise DrakeTeleopError("the live session was stopped")
@@ -317,7 +317,7 @@ class LiveDrive:
             del self._pages[connection]
             live.leave(number, time.perf_counter())
             if not (self._pages or self._stop.is_set()):
-                _print_to_stderr(f"no page is open: the simulation waits{self._start_condition}")
+                _print_to_stderr(f"simulation waits until a page is open{self._start_condition}")
 
 
 def _identify_load(scenario: Scenario, progress: bool | StartStage) -> IdentifiedLoad | None:
@@ -386,7 +386,7 @@ def run_drive_command(
 ) -> None:
     live = drive(scenario, record=record, port=port, browser=browser, device=device)
     reason = live.announce_and_wait("drive it")
-    print(f"\nended by {reason} after {1e-3 * live.ms:.1f} s of simulated time")
+    print(f"\nsession ended by {reason} after {1e-3 * live.ms:.1f} s of simulated time")
     for folder in live.recorded:
         print(f"recorded; repeat it: drake-teleop run --inputs {shlex.quote(folder)}")
     if live.ended:

@@ -22,7 +22,7 @@ from drake_teleop.lab.identified_load import IdentifiedLoad, read_cached_load
 from drake_teleop.live.hand import MakeExternalMasterSide, MakeLiveMasterSide
 from drake_teleop.live.inputs import SLICE_MS, Inputs, read_inputs
 from drake_teleop.live.record import (
-    DEVICE_MARKER_FILE,
+    HAPTIC_DEVICE_FILE,
     LOAD_FILE,
     SCENARIO_FILE,
     BackgroundLog,
@@ -31,7 +31,7 @@ from drake_teleop.live.record import (
 )
 from drake_teleop.live.scenarios import (
     CROSS_FADE_S,
-    adapt_estimate,
+    adapt_load_estimate,
     channel_fill_time_s,
     scenario_of_inputs,
 )
@@ -47,7 +47,7 @@ from drake_teleop.station.station import GetBlock, MakeTeleopStation
 _ROWS_PER_LOG_PART = 2000
 # Duration of a change of scales [s]. A moving slider starts a ramp 60 times a second, and ramps
 # start slowly: longer ones would not progress until the slider rests.
-_SCALE_RAMP_DURATION_S = 0.05
+_FORCE_SCALE_RAMP_S = 0.05
 # Shortest step of error control [s], for real time in contact. A third-order step is stable for
 # vibrations up to 1.7 / step = 1.1 kHz; the ball on a leaf vibrates at up to 700 Hz.
 _MIN_INTEGRATION_STEP_S = 2.5e-4
@@ -58,12 +58,12 @@ _SHORT_STEPS_DURATION_AFTER_REJECT_S = 4e-3
 _DID_NOTHING_EVENT_STATUS = EventStatus.DidNothing()
 
 
-def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
-    """Let the integrator use steps of `shortest` [s] for 4 ms after each rejected step."""
+def take_short_steps_after_rejection(simulator: Simulator, min_step_s: float) -> None:
+    """Let the integrator take steps of `min_step_s` for 4 ms after each rejected step."""
     integrator = simulator.get_mutable_integrator()
     longest = integrator.get_maximum_step_size()
-    shortest = min(shortest, longest)
-    integrator.set_requested_minimum_step_size(shortest)
+    min_step_s = min(min_step_s, longest)
+    integrator.set_requested_minimum_step_size(min_step_s)
     integrator.set_throw_on_minimum_step_size_violation(False)
     # The monitor must not keep the simulator alive.
     station: Any = weakref.ref(simulator)
@@ -75,7 +75,7 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
         number = integrator.get_num_step_shrinkages_from_error_control()
         if number != rejected:
             rejected, until = number, context.get_time() + _SHORT_STEPS_DURATION_AFTER_REJECT_S
-            integrator.set_maximum_step_size(shortest)
+            integrator.set_maximum_step_size(min_step_s)
             integrator.set_fixed_step_mode(True)
         elif context.get_time() >= until:
             until = math.inf
@@ -120,7 +120,7 @@ class _Station:
         seeded = dataclasses.replace(scenario.simulation, seed=scenario.simulation.seed + number)
         self.simulator = simulation.MakeSimulator(self.station, seeded)
         if scenario.simulation.integrator == "runge_kutta3":  # has error control
-            take_short_steps_in_contact(self.simulator, _MIN_INTEGRATION_STEP_S)
+            take_short_steps_after_rejection(self.simulator, _MIN_INTEGRATION_STEP_S)
         self.context = self.simulator.get_mutable_context()
         self.sink = self.station.GetSubsystemByName(LOG_BLOCK_NAME).FindMutableLog(self.context)
         self.columns = simulation.log_slices_of_signals(self.station)
@@ -134,15 +134,15 @@ class _Station:
     def signal_value(self, signal: str) -> Array:
         return np.array(self.station.GetOutputPort(signal).Eval(self.context))
 
-    def set_clutch(self, closed: bool) -> None:
-        self.station.GetInputPort("clutch").FixValue(self.context, [float(closed)])
+    def set_clutch(self, is_engaged: bool) -> None:
+        self.station.GetInputPort("clutch").FixValue(self.context, [float(is_engaged)])
 
-    def take_over_state(self, replaced: _Station, new_channel: bool) -> float:
+    def take_over_state(self, replaced: _Station, has_new_channel: bool) -> float:
         """Copy the replaced station's state; cross-fade from its rendered force to the new one.
 
         Return the time [s] for which the clutch stays open: 0 without a new channel.
         """
-        excluded = {"channel"} if new_channel else set()
+        excluded = {"channel"} if has_new_channel else set()
         if replaced.scenario.wrist_sensor.ideal and not self.scenario.wrist_sensor.ideal:
             excluded.add("wrist_sensor")  # an ideal one keeps the old filters of its predecessor
         if not self.scenario.load_estimator.enabled:
@@ -151,17 +151,17 @@ class _Station:
         if replaced.scenario.wrist_sensor != self.scenario.wrist_sensor:
             sensor, context = self.block_and_context("wrist_sensor")
             sensor.reset_queue(context)
-        wait_s = channel_fill_time_s(self.scenario) if new_channel else 0.0
+        wait_s = channel_fill_time_s(self.scenario) if has_new_channel else 0.0
         cross_fade, context = self.block_and_context("cross_fade")
         rendered = replaced.signal_value("force_to_master")
         cross_fade.StartFade(context, self.context.get_time() + wait_s, CROSS_FADE_S, rendered)
-        if new_channel:
+        if has_new_channel:
             cross_fade.LimitForce(context, _MAX_FORCE_RISE_N + float(np.linalg.norm(rendered[:3])))
         impedances = replaced.scenario.operator.hand, self.scenario.operator.hand
         if impedances[0] != impedances[1]:
             hand, context = self.block_and_context("live_hand")
             hand.KeepWrench(context, *impedances)
-        if not new_channel:
+        if not has_new_channel:
             return 0.0
         name = "pose_command" if replaced.scenario.has_no_network_or_passivity else "pose_received"
         command = replaced.signal_value(name)
@@ -224,14 +224,14 @@ class Session:
             self._station.set_clutch(bool(inputs.clutch) and self.ms >= self._channel_filled_at_ms)
         if inputs.force_scales != before.force_scales:
             scaling, context = self._station.block_and_context("force_scaling")
-            scaling.SetScales(context, **inputs.force_scales, duration=_SCALE_RAMP_DURATION_S)
+            scaling.SetScales(context, **inputs.force_scales, duration=_FORCE_SCALE_RAMP_S)
         if self._record is not None:
             self._record.write(self.ms, inputs)
 
     def _swap_station(self, inputs: Inputs) -> None:
         scenario = scenario_of_inputs(self.scenario, self._load, inputs)
         scenario.check()
-        estimate = adapt_estimate(self.scenario, self._load, scenario)
+        estimate = adapt_load_estimate(self.scenario, self._load, scenario)
         station = _Station(scenario, estimate, self._load, self._station_count, device=self._device)
         has_new_channel = inputs.channel_and_method_inputs != self.inputs.channel_and_method_inputs
         wait_s = station.take_over_state(self._station, has_new_channel)
@@ -280,7 +280,7 @@ class Session:
         return rows
 
     def contact_force(self) -> float:
-        """Return the last contact force times the force scale [N]; 0 if unknown."""
+        """Return the last contact force, scaled for the hand [N]; 0 without a sensor signal."""
         part, sink = self._station.columns.get("contact_wrench_S"), self._station.sink
         if part is None or not sink.num_samples():
             return 0.0
@@ -296,7 +296,7 @@ class Session:
         return self._station.signal_value("force_to_master")
 
     def force_above_limit(self) -> float:
-        """Return by how much the limit after a channel change reduces the force [N]."""
+        """Return the reduction of the force by the limit after a channel change [N]."""
         if self._station_count == 1:
             return 0.0
         cross_fade, context = self._station.block_and_context("cross_fade")
@@ -370,4 +370,4 @@ def read_drive(folder: str | Path) -> RecordedDrive:
         remedy = "record the session again"
         raise DrakeTeleopError(what, where=str(folder / LOAD_FILE), remedy=remedy)
     driven = replace(scenario, simulation__duration=1e-3 * changes[-1][0])
-    return RecordedDrive(driven, load, changes, (folder / DEVICE_MARKER_FILE).exists(), folder)
+    return RecordedDrive(driven, load, changes, (folder / HAPTIC_DEVICE_FILE).exists(), folder)

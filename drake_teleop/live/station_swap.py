@@ -62,7 +62,7 @@ def _copy_block_state(source: Context, target: Context, with_parameters: bool) -
 
 
 @njit(cache=True)
-def _cross_fade_weight(start_and_duration, time):
+def _new_wrench_weight(start_and_duration, time):
     u = min(max((time - start_and_duration[0]) / start_and_duration[1], 0.0), 1.0)
     return u * u * u * (10.0 + u * (6.0 * u - 15.0))
 
@@ -85,7 +85,7 @@ def _force_norm(wrench):
 def build_master_side(
     builder: DiagramBuilder, master: System, inner_side: System, period: float, cross_fade: bool
 ) -> Diagram:
-    """Return `master` with the clutch port of `inner_side` and, if `cross_fade`, a `CrossFade`."""
+    """Build a side from `master` and the clutch of `inner_side`; `cross_fade`: blend wrenches."""
     wrench = master.GetInputPort("wrench_command")
     if cross_fade:
         block = builder.AddNamedSystem("cross_fade", CrossFade(period))
@@ -124,14 +124,14 @@ class CrossFade(framework.LeafSystem):
         self.DeclareVectorOutputPort("felt", 6, weak_callback(self._calc_wrench), inputs)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_fade_weight_and_max_force)
 
-    def StartFade(self, context: Context, start: float, length: float, rendered: Array) -> None:
-        """Cross-fade from the wrench `rendered` (6,), from time `start` [s] for `length` [s]."""
-        change = np.concatenate([[start, length], rendered])
+    def StartFade(self, context: Context, start: float, duration: float, rendered: Array) -> None:
+        """Cross-fade from the wrench `rendered` (6,), from time `start` [s] for `duration` [s]."""
+        change = np.concatenate([[start, duration], rendered])
         context.get_mutable_numeric_parameter(self._change).SetFromVector(change)
         context.get_mutable_discrete_state(self._state)[0] = 0.0
 
     def LimitForce(self, context: Context, max_force: float) -> None:
-        """Limit the force to `max_force` [N] until the new wrench is at most that large."""
+        """Limit the force to `max_force` [N] until the new force is smaller."""
         context.get_mutable_discrete_state(self._state)[1] = max_force
 
     def force_above_limit(self, context: Context) -> float:
@@ -144,7 +144,7 @@ class CrossFade(framework.LeafSystem):
         weight, max_force = state.value(self._state)
         if weight < 1.0:
             change = context.get_numeric_parameter(self._change).value()
-            state.get_mutable_value(self._state)[0] = _cross_fade_weight(change, context.get_time())
+            state.get_mutable_value(self._state)[0] = _new_wrench_weight(change, context.get_time())
         elif max_force < math.inf and _force_norm(self._wrench.Eval(context)) <= max_force:
             state.get_mutable_value(self._state)[1] = math.inf
 

@@ -16,7 +16,7 @@ from drake_teleop.load.regressor import wrench_of_load
 def scaled_wrench_into(
     wrench, offsets, s, omega, alpha, phi_gripper, phi_object, sigma_gr, sigma_obj, gamma, out
 ):
-    """Write `scaled_wrench` (6,), with equal scales of weight and inertia, to `out`."""
+    """Write F' = gamma F_c + V (sigma_gr phi_gripper + sigma_obj phi_object) (6,) to `out`."""
     a, b = sigma_gr - gamma, sigma_obj - gamma
     phi = (
         a * phi_gripper[0] + b * phi_object[0], a * phi_gripper[1] + b * phi_object[1],
@@ -34,7 +34,7 @@ def scaled_wrench_into(
 
 @njit(cache=True)
 def add_excess_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out):
-    """Add the parts' weights, times excess scales (weight minus inertia), to the wrench `out`."""
+    """Add weights of gripper and object, times weight scale minus inertia scale, to `out` (6,)."""
     a, b = excess_gripper, excess_object
     up = scale_vector(-1.0, vector_at(gravity, 0))
     h = plus(scale_vector(a, vector_at(phi_gripper, 1)), scale_vector(b, vector_at(phi_object, 1)))
@@ -109,7 +109,7 @@ def scaled_wrench(
     )
     scales = *inertias, _check_scale("gamma", gamma)
     if weights != inertias and gravity is None:
-        raise unknown_gravity_error("gravity", "pass gravity, g in S, for each sample")
+        raise unknown_gravity_error("gravity", "pass gravity in the sensor frame for each sample")
     phis = finite_array("phi_gripper", phi_gripper, 10), finite_array("phi_object", phi_object, 10)
     named = {"wrench": (wrench, 6), "offsets": (offsets, 6)}
     named |= {"s": (s, 3), "omega": (omega, 3), "alpha": (alpha, 3)}
@@ -139,7 +139,7 @@ def unknown_gravity_error(where: str, remedy: str) -> DrakeTeleopError:
 
 
 def scales_from_eta(eta: float) -> tuple[float, float, float]:
-    """Return sigma_gripper = 0, sigma_object = eta (remaining share) and gamma = 1, Eq. (14)."""
+    """Return sigma_gripper 0, sigma_object `eta` (share of its wrench) and gamma 1, Eq. (14)."""
     if not 0.0 <= to_float("eta", eta) <= 1.0:
         what = f"{eta:g} is outside 0 to 1"
         raise DrakeTeleopError(what, where="eta", remedy="give the object's remaining share")
@@ -149,5 +149,5 @@ def scales_from_eta(eta: float) -> tuple[float, float, float]:
 def _check_scale(name: str, value: float) -> float:
     if not 0.0 <= to_float(name, value) < np.inf:
         what = f"{value} is not a finite number >= 0"
-        raise DrakeTeleopError(what, where=name, remedy="give a scale, such as 0 or 1")
+        raise DrakeTeleopError(what, where=name, remedy="give a finite scale >= 0")
     return float(value)

@@ -28,7 +28,7 @@ PARAMETER_NAMES = (
 PARAMETER_UNITS = ("N",) * 3 + ("N m",) * 3 + ("kg",) + ("kg m",) * 3 + ("kg m^2",) * 6
 """Unit of each parameter."""
 
-MAX_IDENTIFIED_SCALED_STD = 0.05
+MAX_IDENTIFIED_RELATIVE_STD = 0.05
 """Largest standard deviation of an identified parameter, relative to its natural scale."""
 # Limit of "weakly" relative to the natural scale, smallest size of a load [m], gravity [m/s^2].
 _MAX_WEAKLY_IDENTIFIED_SCALED_STD, _MIN_LOAD_SIZE_M, _G_M_S2 = 0.5, 0.03, 9.81
@@ -50,7 +50,7 @@ class Identification:
         offsets: (6,) sensor offsets [N, N m].
         covariance: (16, 16) of [offsets; phi] [SI]; undetermined: variance inf (null in the file).
         identifiable: (16,) True for identified parameters, see `verdicts`.
-        condition_number: of the scaled matrix [E V] of Eq. (8), in the determined directions.
+        condition_number: of the regressor [E V] with scaled columns, Eq. (8).
         delay_s: delay of the motion behind the wrench [s].
         residual_rms: (6,) RMS residual of the wrench channels [N, N m].
         method: name of the estimator.
@@ -114,8 +114,8 @@ class Identification:
         return tuple(np.where(self.identifiable, "identified", rest).tolist())
 
     def with_unidentified_load(self) -> Identification:
-        """Return the result with all ten load parameters marked as not identified."""
-        return replace(self, identifiable=self.identifiable & ~_IS_LOAD_PART_OF_THETA)
+        """Return the result with all load parameters marked as not identified."""
+        return replace(self, identifiable=self.identifiable & ~_LOAD_PARAMETER_MASK)
 
     def with_nothing_identified(self) -> Identification:
         """Return the result with infinite variances: all `verdicts` are "not"."""
@@ -170,8 +170,8 @@ class Identification:
         fields = {name: _parse_file_field(f"{path}:{name}", name, document[name]) for name in names}
         result = cls(**{name: fields[name] for name in cls.__dataclass_fields__ if name in fields})
         if fields.get("verdicts", list(result.verdicts)) != list(result.verdicts):
-            others = "phi, covariance, identifiable or prior_dominated"
-            raise _file_error(f"contradicts {others}", f"{path}:verdicts")
+            what = "contradicts phi, covariance, identifiable or prior_dominated"
+            raise _file_error(what, f"{path}:verdicts")
         for name in _DERIVED_FILE_FIELDS:
             stated, value = fields[name], getattr(result, name)
             is_flag = isinstance(value, bool)
@@ -199,18 +199,18 @@ def com_standard_deviations(phi: Array, covariance: Array) -> Array:
 
 
 def is_precise_enough(standard_deviations: Array, phi: Array) -> NDArray[np.bool_]:
-    return standard_deviations <= MAX_IDENTIFIED_SCALED_STD * natural_scales(phi)
+    return standard_deviations <= MAX_IDENTIFIED_RELATIVE_STD * natural_scales(phi)
 
 
-def mark_undetermined(covariance: Array, undetermined: NDArray[np.bool_]) -> Array:
+def mark_undetermined(covariance: Array, is_undetermined: NDArray[np.bool_]) -> Array:
     """Return the covariance (n, n) with variance inf and no correlation for flagged parameters."""
-    out = np.where(undetermined[:, None] | undetermined, 0.0, covariance)
-    out[undetermined, undetermined] = np.inf
+    out = np.where(is_undetermined[:, None] | is_undetermined, 0.0, covariance)
+    out[is_undetermined, is_undetermined] = np.inf
     return out
 
 
 def natural_scales(phi: Array) -> Array:
-    """Return typical sizes (16,) of [offsets; phi] for a load with this mass and centre of mass."""
+    """Return typical magnitudes (16,) of [offsets; phi] for a load of this mass and centre."""
     m = abs(phi[0])
     L = max(float(np.linalg.norm(phi[1:4])) / m, _MIN_LOAD_SIZE_M)
     scale: Array = m * np.repeat([_G_M_S2, _G_M_S2 * L, 1.0, L, L * L / 3.0], [3, 3, 1, 3, 6])
@@ -252,15 +252,16 @@ def _parse_file_field(where: str, name: str, value: Any) -> Any:
         return np.array(flags, dtype=bool)
     if name == "degrees_of_freedom":
         given = value if isinstance(value, list) else [""]
-        _require_numbers(where, [v for v in given if v is not None], "a list of 16 numbers or null")
+        what = "is not a list of 16 numbers or null"
+        _require_numbers(where, [v for v in given if v is not None], what)
         degrees = finite_array(where, [1.0 if v is None else v for v in given], 16)
         if (degrees <= 0.0).any():
             raise _file_error(f"has a value that is not positive ({degrees.min():g})", where)
         return np.where([v is None for v in given], np.inf, degrees)
-    kinds = {"method": (str, "a text"), "weight_removed": (bool, "true or false")}
-    kind, expected = kinds.get(name, (object, ""))
+    kinds = {"method": (str, "is not a text"), "weight_removed": (bool, "is not true or false")}
+    kind, what = kinds.get(name, (object, ""))
     if not isinstance(value, kind):
-        raise _file_error(f"is not {expected}", where)
+        raise _file_error(what, where)
     return value
 
 
@@ -280,19 +281,18 @@ def _parse_covariance(where: str, value: Any) -> Array:
     return np.where(unknown, np.inf, covariance)
 
 
-def _require_numbers(where: str, value: Any, expected: str = "") -> None:
+def _require_numbers(where: str, value: Any, what: str = "has values that are not numbers") -> None:
     if isinstance(value, list):
         for each in value:
-            _require_numbers(where, each, expected)
+            _require_numbers(where, each, what)
     elif isinstance(value, bool) or not isinstance(value, (int, float)):
-        what = f"is not {expected}" if expected else "contains values that are not numbers"
         raise _file_error(what, where)
 
 
 MIN_SIGNIFICANT_STDS = 3.0
 """Distance from zero of a significant value [standard deviations]."""
 
-_IS_LOAD_PART_OF_THETA = np.arange(16) >= 6
+_LOAD_PARAMETER_MASK = np.arange(16) >= 6
 
 
 def load_of_object(total: Identification, gripper: Identification) -> Identification:
@@ -316,14 +316,14 @@ def load_of_object(total: Identification, gripper: Identification) -> Identifica
         phi=phi,
         covariance=covariance,
         identifiable=identifiable,
-        degrees_of_freedom=_degrees_of_freedom_of_load_difference(total, gripper),
-        prior_dominated=total.prior_dominated | gripper.prior_dominated & _IS_LOAD_PART_OF_THETA,
+        degrees_of_freedom=_statistical_dof_of_load_difference(total, gripper),
+        prior_dominated=total.prior_dominated | gripper.prior_dominated & _LOAD_PARAMETER_MASK,
     )
 
 
-def _degrees_of_freedom_of_load_difference(total: Identification, gripper: Identification) -> Array:
+def _statistical_dof_of_load_difference(total: Identification, gripper: Identification) -> Array:
     a, b = (np.diag(load.covariance) for load in (total, gripper))
-    b = np.where(_IS_LOAD_PART_OF_THETA, b, 0.0)
+    b = np.where(_LOAD_PARAMETER_MASK, b, 0.0)
     finite = np.isfinite(a + b) & (a + b > 0.0)
     a, b = np.where(finite, a, 1.0), np.where(finite, b, 0.0)
     with np.errstate(divide="ignore"):
@@ -334,7 +334,7 @@ def _degrees_of_freedom_of_load_difference(total: Identification, gripper: Ident
 def consistency_margin(load: Identification) -> tuple[float, float]:
     """Return the smallest eigenvalue of the pseudo-inertia, Eq. (T1), and its standard deviation.
 
-    Units of mass and length are m and sqrt(tr Sigma / m). Rigid bodies have no negative eigenvalue.
+    Units are the mass, and the length sqrt(tr Sigma / m). Rigid bodies have no negative eigenvalue.
     """
     J = pseudo_inertia(load.phi)
     mass, spread = abs(J[3, 3]), abs(float(np.trace(J[:3, :3])))

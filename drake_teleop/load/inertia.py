@@ -50,7 +50,7 @@ def inertia_about_origin(phi: ArrayLike) -> Array:
 
 
 def pseudo_inertia(phi: ArrayLike) -> Array:
-    """Return the pseudo-inertia J = [Sigma, m c; m c^T, m] (4, 4) of phi, Eq. (T1)."""
+    """Return the pseudo-inertia J = [Sigma, m c; m c^T, m] (4, 4), Eq. (T1)."""
     phi = finite_array("phi", phi, 10)
     I = inertia_about_origin(phi)  # noqa: E741
     J = np.empty((4, 4))
@@ -64,7 +64,7 @@ def phi_from_pseudo_inertia(J: ArrayLike) -> Array:
     J = finite_array("J", J, 4, 4)
     if np.abs(J - J.T).max() > 1e-9 * np.abs(J).max():
         what = "the pseudo-inertia is not symmetric"
-        raise DrakeTeleopError(what, where="J", remedy="give (J + J.T) / 2")
+        raise DrakeTeleopError(what, where="J", remedy="give the symmetric part")
     Sigma = J[:3, :3]
     I = np.trace(Sigma) * np.eye(3) - Sigma  # noqa: E741
     return np.concatenate([[J[3, 3]], J[:3, 3], I[np.triu_indices(3)]])

@@ -45,10 +45,10 @@ _MIN_DOF_OF_LONGEST_BLOCKS, _MIN_FIT_DOF_SHARE_IN_BLOCKS = 20.0, 0.9
 # Largest difference of specific force in one orientation [m/s^2], and level of the F test.
 _SAME_POSE_DISTANCE_M_S2, _POSE_F_TEST_LEVEL = 0.05, 0.01
 # Largest relative residual that is rounding of the sums.
-_MAX_ROUNDING_OVER_WRENCH = 1e-6
+_MAX_RELATIVE_ROUNDING = 1e-6
 # Indices of wrench, specific force and products w_i w_j in z.
 _WRENCH_COLUMNS, _SPECIFIC_FORCE_COLUMNS = slice(1, 7), slice(7, 10)
-_OMEGA_PRODUCTS_IN_Z = np.array([[13, 16, 17], [16, 14, 18], [17, 18, 15]])
+_OMEGA_PRODUCT_INDICES = np.array([[13, 16, 17], [16, 14, 18], [17, 18, 15]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,8 +136,8 @@ class SecondMoments:
         Q = np.zeros((19, 19))
         std = np.concatenate([wrench, noise.motion[0], noise.motion[2]])
         Q[np.arange(1, 13), np.arange(1, 13)] = std**2
-        products = self.mean_products[0, _OMEGA_PRODUCTS_IN_Z]
-        jacobians = omega_product_jacobians(_OMEGA_PRODUCTS_IN_Z, 19)
+        products = self.mean_products[0, _OMEGA_PRODUCT_INDICES]
+        jacobians = omega_product_jacobians(_OMEGA_PRODUCT_INDICES, 19)
         for std, J in zip(noise.motion[1], jacobians, strict=True):
             Q += std**2 * J.T @ products @ J
         return Q
@@ -260,7 +260,7 @@ class SecondMoments:
         weaker = found & (longest * np.exp(3.0 * np.sqrt(2.0 / longest_degrees)) < variances)
         variances = np.where(weaker, longest, variances)
         degrees = np.where(weaker, longest_degrees, degrees)
-        return variances, degrees, slow & (n * of_samples > _MAX_ROUNDING_OVER_WRENCH**2 * wrench)
+        return variances, degrees, slow & (n * of_samples > _MAX_RELATIVE_ROUNDING**2 * wrench)
 
     def _residual_variances_of_poses_at_rest(
         self, square_sums: Array, fit_dof: Array, theta: Array
@@ -326,9 +326,10 @@ def identify(
     return equations.solve(delay_s)
 
 
-def unidentifiable_mass_error(what: str) -> DrakeTeleopError:
+def unidentifiable_mass_error(reason: str) -> DrakeTeleopError:
     remedy = "check that the sensor is connected and that its orientation changes"
-    return DrakeTeleopError(f"{what}: the mass cannot be identified", where="wrench", remedy=remedy)
+    what = f"the mass cannot be identified: {reason}"
+    return DrakeTeleopError(what, where="wrench", remedy=remedy)
 
 
 @cache
@@ -417,9 +418,9 @@ def _regressor_sums_of_blocks(blocks: Array) -> Array:
 
 
 @njit(cache=True)
-def _add_sample_products(wrench, s, omega, alpha, weights, sums, blocks, state):
+def _add_sample_products(wrench, s, omega, alpha, weights, sums, blocks, block_state):
     z = np.empty(19)
-    last, length, filled = state
+    last, length, filled = block_state
     for i in range(wrench.shape[0]):
         if filled == length:
             last, filled = last + 1, 0
@@ -440,4 +441,4 @@ def _add_sample_products(wrench, s, omega, alpha, weights, sums, blocks, state):
             blocks[last, j] += weighted
             for k in range(j, 19):
                 sums[j, k] += weighted * z[k]
-    state[0], state[1], state[2] = last, length, filled
+    block_state[0], block_state[1], block_state[2] = last, length, filled

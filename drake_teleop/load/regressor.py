@@ -3,7 +3,7 @@
 A sample is one row of these numbers, in logs the first 15::
 
     [measured wrench (6) | specific force (3) | angular velocity (3) | angular acceleration (3) |
-     saturated or lost | joint positions (n) | time (output of the wrist sensor only)]
+     flag: 1 saturated, >= 2 lost | joint positions (n) | time (output of the wrist sensor only)]
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from drake_teleop.common.vectors import (
     vector_at,
 )
 
-SAMPLE_WRENCH = slice(0, 6)
-SAMPLE_SPECIFIC_FORCE = slice(6, 9)
-SAMPLE_ANGULAR_VELOCITY = slice(9, 12)
-SAMPLE_ANGULAR_ACCELERATION = slice(12, 15)
-SAMPLE_MOTION = slice(6, 15)  #: specific force, angular velocity and angular acceleration of S
-SAMPLE_WRENCH_AND_MOTION = slice(0, 15)
+WRENCH_SLICE = slice(0, 6)
+SPECIFIC_FORCE_SLICE = slice(6, 9)
+ANGULAR_VELOCITY_SLICE = slice(9, 12)
+ANGULAR_ACCELERATION_SLICE = slice(12, 15)
+MOTION_SLICE = slice(6, 15)  #: specific force, angular velocity and angular acceleration of S
+WRENCH_AND_MOTION_SLICE = slice(0, 15)
 SATURATION_FLAG_INDEX = 15  #: above 0.5 the wrench is not valid
 #: From this value of the saturation flag on, the reading was lost or impossible: the sample is an
 #: old one. The excess counts the samples with remaining effects.
-MIN_LOST_SAMPLE_FLAG_VALUE = 2.0
+LOST_SAMPLE_FLAG_THRESHOLD = 2.0
 FIRST_JOINT_INDEX = 16
-SAMPLE_JOINT_POSITIONS = slice(FIRST_JOINT_INDEX, None)
+JOINT_POSITIONS_SLICE = slice(FIRST_JOINT_INDEX, None)
 SAMPLE_TIME_INDEX = -1  #: [s], only in the output of the wrist sensor
 
 
@@ -116,7 +116,6 @@ def non_contact_wrench(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike, phi: Ar
 
 
 def signal_sizes_of_sample(num_joints: int) -> dict[str, int]:
-    """Return signal names and sizes of a wrist sensor's sample, in order."""
     return {
         "measured_wrench_S": 6,
         "specific_force_S": 3,

@@ -78,7 +78,7 @@ def parse_tolerance(text: str) -> Tolerance:
 
 
 def derivatives_over_tolerances(tolerance: Tolerance, phi: Array) -> Array:
-    """Return derivatives (k, 16) by [offsets; phi] of required entries, divided by tolerances."""
+    """Return derivatives (k, 16) of mass, com x ... by [offsets; phi], divided by tolerances."""
     m, c, inertia = mass_com_inertia(phi)
     rows = np.zeros((10, 10))
     rows[0, 0] = 1.0 / m
@@ -89,20 +89,20 @@ def derivatives_over_tolerances(tolerance: Tolerance, phi: Array) -> Array:
     for k in range(3):
         rows[4:, 1 + k] = -(2.0 * c[k] * E - (np.outer(E[k], c) + np.outer(c, E[k])))[upper]
     rows[4:, 4:] = np.eye(6)
-    scale = _bounded_mean_principal_moment(m, c, inertia)
+    scale = _lower_bounded_mean_moment(m, c, inertia)
     parts = {"mass": (rows[:1], 1.0), "com": (rows[1:4], 1.0), "inertia": (rows[4:], scale)}
     required = [(*parts[x], getattr(tolerance, x)) for x in tolerance.required_quantity_names]
     out = np.concatenate([part / (size * limit) for part, size, limit in required])
     return np.hstack([np.zeros((len(out), 6)), out])
 
 
-def _bounded_mean_principal_moment(m: float, c: Array, inertia_com: Array) -> float:
+def _lower_bounded_mean_moment(m: float, c: Array, inertia_com: Array) -> float:
     # Lower bound, because a poorly determined inertia can have any estimate.
     return max(float(np.trace(inertia_com)) / 3.0, 1e-4 * abs(m) * (float(c @ c) + 1e-4))
 
 
 def deviations_over_tolerances(derivatives: Array, covariance: Array) -> Array:
-    """Return standard deviations (k,) of required entries over tolerances; inf: undetermined."""
+    """Return standard deviations (k,) divided by tolerances; inf: undetermined."""
     unknown = np.isinf(np.diag(covariance))
     finite = np.where(unknown | unknown[:, np.newaxis], 0.0, covariance)
     variances = np.einsum("ki,ij,kj->k", derivatives, finite, derivatives)
@@ -111,16 +111,16 @@ def deviations_over_tolerances(derivatives: Array, covariance: Array) -> Array:
 
 
 def display_values_of_required_entries(tolerance: Tolerance, phi: Array) -> Array:
-    """Return the values (k,) of required entries of load phi [kg, mm, kg m^2]."""
+    """Return the values (k,) of mass, com x ... that have a tolerance [kg, mm, kg m^2]."""
     m, c, inertia = mass_com_inertia(phi)
     values = {"mass": [m], "com": 1e3 * c, "inertia": inertia[np.triu_indices(3)]}
     return np.concatenate([values[name] for name in tolerance.required_quantity_names])
 
 
 def tolerances_in_display_units(tolerance: Tolerance, phi: Array) -> Array:
-    """Return the absolute tolerances (k,) of required entries for load phi [kg, mm, kg m^2]."""
+    """Return the absolute tolerances (k,) of mass, com x ... [kg, mm, kg m^2]."""
     m, c, inertia = mass_com_inertia(phi)
-    scales = {"mass": abs(m), "com": 1e3, "inertia": _bounded_mean_principal_moment(m, c, inertia)}
+    scales = {"mass": abs(m), "com": 1e3, "inertia": _lower_bounded_mean_moment(m, c, inertia)}
     names = tolerance.required_quantity_names
     sizes = [scales[name] * getattr(tolerance, name) for name in names]
     return np.repeat(sizes, [len(ENTRY_NAMES_OF_QUANTITY[name]) for name in names])

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.numeric import Array, find_runs_of_true
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.common.texts import parse_yaml
-from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
+from drake_teleop.load.batch.uncertainty import WRENCH_CHANNEL_NAMES
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.logs.causes.candidates import MAX_PLAUSIBLE_MASS_KG, has_negative_mass
 from drake_teleop.logs.causes.cause import Finding
@@ -169,7 +169,7 @@ def _correct_fields_by_cause(
             for name in set(_POSITION_FIELDS) & set(fields):
                 fields[name] = fields[name] + values["position_in_sensor"]
         case "gain" if column is not None:
-            c = CHANNEL_NAMES.index(values["channel"])
+            c = WRENCH_CHANNEL_NAMES.index(values["channel"])
             name = "wrench.force.scale" if c < 3 else "wrench.torque.scale"
             fields[name] = fields[name].copy()
             fields[name][column[c % 3]] /= values["gain"]

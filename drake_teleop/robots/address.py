@@ -49,8 +49,8 @@ class Address:
             raise DrakeTeleopError(what, where=self.text, remedy="separate them by commas")
         return values
 
-    def wrench_name(self) -> str:
-        """Return the parameter `wrench`: "contact" (default) or "scaled"."""
+    def requested_wrench_name(self) -> str:
+        """Return the name of the wrench to send: "contact" (default) or "scaled"."""
         return self._chosen_value("wrench", ("contact", "scaled"), "give contact or scaled")
 
     def wrench_sign(self) -> float:

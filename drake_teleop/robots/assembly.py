@@ -45,7 +45,7 @@ DELAY_FORGETTING_TIME_S = 10.0
 """Time constant of the exponential weights of past samples [s]."""
 MAX_DELAY_STD_S = 5e-4
 """Maximum standard deviation of an estimate that changes the delay [s]."""
-MAX_DELAY_SLEW = 0.005
+MAX_DELAY_SLEW_RATE = 0.005
 """Maximum rate of change of the delay [s/s]."""
 MAX_DELAY_S = 0.1
 """Maximum magnitude of the delay [s]."""
@@ -85,7 +85,7 @@ class DelayTracker:
     def update_delay(
         self, at: TimedMotion, wrench: Array, before: TimedMotion, after: TimedMotion
     ) -> None:
-        """Update the delay by a wrench (6,), the motion at its time, and those before and after."""
+        """Update the delay by a wrench (6,), the motion `at` its time, one before and one after."""
         t, step = at[0], after[0] - before[0]
         elapsed = t - self._t
         if 0.0 <= elapsed < DELAY_SAMPLE_PERIOD_S or step <= 0.0:
@@ -107,18 +107,18 @@ class DelayTracker:
             self._count = fade * self._count + 1.0
             products = slope, residual, slope * slope, slope * residual, residual * residual
             self._sums = fade * self._sums + np.stack(products)
-            self._slew_delay(min(elapsed, DELAY_FORGETTING_TIME_S))
+            self._change_delay_at_limited_rate(min(elapsed, DELAY_FORGETTING_TIME_S))
 
-    def _is_inlier(self, residual: Array, slope: Array) -> bool:
+    def _is_inlier(self, residual: Array, wrench_rate: Array) -> bool:
         starting = self._samples < _MIN_DELAY_SAMPLES
-        limit = _MAX_INLIER_RESIDUAL_SIGMAS * self._noise + self._delay_error * np.abs(slope)
+        limit = _MAX_INLIER_RESIDUAL_SIGMAS * self._noise + self._delay_error * np.abs(wrench_rate)
         drift, offsets = starting * MAX_SENSOR_OFFSET_DRIFT, self._offsets
         limit += RELATIVE_LOAD_WRENCH_ERROR * np.abs(self._wrenches[0]) + drift
         if not starting:
             offsets = (self._sums[1] - self._sums[0] * self.delay_s) / self._count
         return bool((np.abs(residual - offsets) < limit).all())
 
-    def _slew_delay(self, elapsed_s: float) -> None:
+    def _change_delay_at_limited_rate(self, elapsed_s: float) -> None:
         if self._samples < _MIN_DELAY_SAMPLES:
             return
         g, r, gg, gr, rr = self._sums / self._count
@@ -130,7 +130,7 @@ class DelayTracker:
         noise_ratio = max(1.0, float(self._weights @ rest) / 6.0)  # variance over the stated noise
         self._delay_error = MAX_DELAY_ERROR_BEFORE_ESTIMATE_S
         if math.sqrt(noise_ratio / (information * self._count)) < MAX_DELAY_STD_S:
-            max_change = MAX_DELAY_SLEW * elapsed_s
+            max_change = MAX_DELAY_SLEW_RATE * elapsed_s
             correction = min(MAX_DELAY_S, max(-MAX_DELAY_S, estimate)) - self.delay_s
             self.delay_s += min(max_change, max(-max_change, correction))
             tracked = MAX_DELAY_ERROR_AFTER_ESTIMATE_S + abs(correction)
@@ -248,7 +248,7 @@ class MotionWindow:
             self.reset()
 
     def motions_completed_by(self, sample: Reading) -> list[tuple[float, Array]]:
-        """Add a sample; return new times [s], motions [s, omega, alpha; gravity if from poses]."""
+        """Add a sample; return pairs: time [s], motion (s, omega, alpha, gravity with poses)."""
         row = self._motion_row_if_valid(sample)
         if row is None:
             return []
@@ -319,7 +319,7 @@ class ReadingAssembler(Source):
 
     Args:
         delay_s: delay of the motion's time stamps behind the wrench's [s].
-        track: load for tracking this delay; None for a constant delay.
+        track: load for online estimation of the delay; None: constant delay.
         X_FS: (7,) pose of the sensor in the frame F of the poses, [w x y z, position].
         weight_removed: True if the robot has removed the load's weight from the wrench.
     """

@@ -31,7 +31,7 @@ TOLERANCE_CONFIDENCE = 0.9998
 """Level of the interval that must be within the tolerance."""
 RECORD_GROWTH_FACTOR = 1.12
 """Growth factor of the record from one result to the next."""
-FIRST_RECORD_S = 1.0
+MIN_EVALUATED_RECORD_S = 1.0
 """Length of the record at the first result [s]."""
 MIN_DEGREES_OF_FREEDOM = 20.0
 """Minimum degrees of freedom of the variance of a known parameter."""
@@ -58,8 +58,7 @@ class RecordEvaluation:
     Attributes:
         identified_log: load and findings of the record; None if this failed for reason `failure`.
         relative_half_widths: (k,) of the 95 % intervals, divided by the tolerances.
-        is_within_tolerance: (k,) True if the `TOLERANCE_CONFIDENCE` interval is within the
-            tolerance, without `doubts`.
+        is_within_tolerance: (k,) True if the 99.98 % interval is, and there are no `doubts`.
         is_known: (k,) True if the previous result was within the tolerance, too.
         doubts: problems of the record; no parameter is known then.
     """
@@ -82,7 +81,7 @@ def evaluate_record(
     cutoff_hz: float | None,
     delay: str | float,
 ) -> RecordEvaluation:
-    """Return a record's identified load, its uncertainty over the tolerance, and advice."""
+    """Return load, accuracy and advice for a record; `previous`: evaluation before, or None."""
     count, found, why = len(tolerance.required_entry_names), None, ""
     try:
         found = identify_log(path, cutoff_hz=cutoff_hz, delay=delay)
@@ -118,7 +117,7 @@ def evaluate_record(
 def half_widths_and_dof_over_tolerances(
     found: IdentifiedLog, tolerance: tolerances.Tolerance
 ) -> tuple[Array, Array, Array]:
-    """Return half widths (95 %, `TOLERANCE_CONFIDENCE`) over tolerances, and degrees of freedom."""
+    """Return half widths over tolerances, at 95 % and 99.98 %, and degrees of freedom (k,)."""
     load = found.identification
     errors = tolerances.derivatives_over_tolerances(tolerance, load.phi)
     deviations = tolerances.deviations_over_tolerances(errors, load.covariance)
@@ -142,13 +141,13 @@ def advise_motion(
     motion: tuple[Array, Array, Array],
     dt: float,
     cutoff_hz: float | None,
-    errors: Array,
+    derivatives: Array,
     noise: Array,
 ) -> str:
     """Return the next motion that reduces the uncertainty most, in words.
 
-    `motion`: recorded s, omega, alpha, (N, 3) each; `errors`: `derivatives_over_tolerances`;
-    `noise` (6,) [N, N m].
+    `motion`: recorded s, omega, alpha, (N, 3) each; `derivatives` (k, 16): of mass, com x ... by
+    [offsets; phi], divided by tolerances; `noise` (6,) [N, N m].
     """
     rate = 1.0 / dt
     if cutoff_hz is not None:
@@ -161,7 +160,7 @@ def advise_motion(
     last = motion[0][-max(1, round(0.2 / dt)) :].mean(axis=0)
     best, least = "", np.inf
     for words, of_motion in _information_of_advised_motions(last, noise, rate):
-        left = tolerances.deviations_over_tolerances(errors, np.linalg.inv(gram + of_motion))
+        left = tolerances.deviations_over_tolerances(derivatives, np.linalg.inv(gram + of_motion))
         cost = float(np.log(np.maximum(left, 1.0)).sum()) + 1e-6 * float(left.sum())
         if cost < least:
             best, least = words, cost
@@ -169,9 +168,9 @@ def advise_motion(
 
 
 def _information_of_advised_motions(
-    up: Array, noise_std: Array, rate_hz: float
+    up_S: Array, noise_std: Array, rate_hz: float
 ) -> Iterator[tuple[str, Array]]:
-    s0 = _GRAVITY_M_S2 * up / max(float(np.linalg.norm(up)), 1e-9)
+    s0 = _GRAVITY_M_S2 * up_S / max(float(np.linalg.norm(up_S)), 1e-9)
     t = np.arange(_ADVISED_MOTION_SAMPLES) * (_ADVISED_MOTION_S / _ADVISED_MOTION_SAMPLES)
     for words, size, hertz in _ADVISED_MOTIONS:
         w = 2.0 * np.pi * hertz
@@ -209,12 +208,12 @@ def calibrate(
     seconds: float = 120.0,
     show: Callable[[RecordEvaluation], None] = lambda _: None,
 ) -> list[RecordEvaluation]:
-    """Record a stream until the tolerance is met or it ends; return evaluations.
+    """Record a stream into `path` until the tolerance is met or it ends; return evaluations.
 
     Record at most `seconds`; end if a live stream stalls for max(`seconds`, 10 s).
     """
     results: list[RecordEvaluation] = []
-    next_length_s = FIRST_RECORD_S
+    next_length_s = MIN_EVALUATED_RECORD_S
     earlier = [path.with_name(name) for name in recorder.file_names] if source.live else []
     pending: Future[RecordEvaluation] | None = None
 

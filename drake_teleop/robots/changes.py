@@ -25,7 +25,7 @@ from drake_teleop.robots.compensator import MIN_CLOCK_JUMP_S
 
 TESTED_RECORD_SPAN_S = 20.0
 """Length of the record that a test examines [s]."""
-MIN_FLAGGED_TIME_S = 2.0
+MIN_FLAG_TIME_BEFORE_TEST_S = 2.0
 """Minimum duration of contact or load flags before a test [s]."""
 _CHANGE_TEST_TRIGGER_FLAGS = int(streams.ReadingFlag.IN_CONTACT | streams.ReadingFlag.OTHER_LOAD)
 _FLAGS_EXCLUDED_FROM_TEST = ~int(streams.NONZERO_WRENCH_FLAGS)
@@ -64,11 +64,11 @@ class ZeroAndLoadMonitor:
         if output_flags & _CHANGE_TEST_TRIGGER_FLAGS:
             self._last_flagged = t
             if self._flagged_since > t:
-                self._flagged_since, self._next_attempt = t, t + MIN_FLAGGED_TIME_S
+                self._flagged_since, self._next_attempt = t, t + MIN_FLAG_TIME_BEFORE_TEST_S
         elif t - self._last_flagged > _MAX_PAUSE_IN_FLAGGED_TIME_S:
             self._flagged_since = math.inf
         if self._pending is None and t >= self._next_attempt and self._flagged_since <= t:
-            spacing_s = max(MIN_FLAGGED_TIME_S, 0.5 * (t - self._flagged_since))
+            spacing_s = max(MIN_FLAG_TIME_BEFORE_TEST_S, 0.5 * (t - self._flagged_since))
             self._next_attempt = t + min(spacing_s, _MAX_TEST_SPACING_S)
             find = _find_changes_in_subprocess if self._live else find_zero_and_load_changes
             self._pending = self._executor.submit(find, self._rows_in_time_order(), self._dt)
@@ -90,7 +90,7 @@ class ZeroAndLoadMonitor:
     def _report_changes(self, found: Future[list[TimedChangeText]]) -> None:
         error = found.exception()
         if error is not None:  # the loop continues
-            self._report(f"the test for a tare or another load failed ({error})")
+            self._report(f"error in the test for a tare or another load ({error})")
             return
         for time, words in found.result():
             if all(abs(time - t) > _MIN_REPORTED_CHANGE_SPACING_S for t in self._reported):

@@ -20,7 +20,7 @@ from drake_teleop.logs.causal import low_pass_delay_s
 from drake_teleop.logs.processing import notes_on_undetermined_load
 from drake_teleop.robots.assembly import ReadingAssembler
 from drake_teleop.robots.changes import ZeroAndLoadMonitor
-from drake_teleop.robots.compensator import SCALE_NAMES, TARE_REST_S, Compensator
+from drake_teleop.robots.compensator import SCALE_NAMES, TARE_AVERAGING_S, Compensator
 from drake_teleop.robots.connections import is_file_address, open_sink, open_source
 from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.streams import CompensatedWrench, Sink, Source
@@ -60,9 +60,9 @@ def compensate_stream(
     changes: ZeroAndLoadMonitor | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> Counter[str]:
-    """Compensate readings until the source ends or Ctrl-C; return counts of wrenches and flags."""
+    """Compensate readings until the end or Ctrl-C, `tare` True: tare first; return flag counts."""
     counts: Counter[str] = Counter(wrenches=0)
-    tare_count = np.inf if not tare else round(TARE_REST_S / source.dt)
+    tare_count = np.inf if not tare else round(TARE_AVERAGING_S / source.dt)
 
     def write_and_count(out: CompensatedWrench) -> None:
         sink.write(out)
@@ -116,7 +116,7 @@ def run_compensate_command(
         sensor_range: range of the sensor: force [N], torque [N m].
         free: log of free motion, for contact detection.
         control: UDP port that accepts the request `tare`.
-        attach: receives the function that makes compensators; returns the one in use.
+        attach: hook of the ROS 2 node: from the maker of compensators to the one in use.
         options: those of `Compensator.set_scales` and `open_source`.
     """
     found = Identification.load(load)
@@ -150,13 +150,13 @@ def run_compensate_command(
     for path in file:
         refuse_to_replace_inputs(path, *input_files)
     if earlier := move_earlier_recordings(*file if readings.live else ()):
-        report(f"{sink} exists; it is moved to {earlier}")
+        report(f"{sink} exists; the existing file is moved to {earlier}")
     wrenches = open_sink(sink)
     changes = ZeroAndLoadMonitor(readings.dt, live=readings.live, report=report) if watch else None
     for note in notes_on_undetermined_load(found):
         report(f"warning: {note}")
     late_s = 0.0 if predicted else compensator.lag_s
-    report(f"outputs are {1e3 * (getattr(readings, 'lag_s', 0.0) + late_s):.1f} ms late")
+    report(f"output delay: {1e3 * (getattr(readings, 'lag_s', 0.0) + late_s):.1f} ms")
     stale_ms = 1e3 * compensator.stale_age_s
     report(f"readings are stale after {stale_ms:.0f} ms; invalid wrenches are zero")
     if sensor_range is None:
@@ -166,8 +166,8 @@ def run_compensate_command(
         counts = compensate_stream(readings, compensator, wrenches, **loop)
         report(", ".join(f"{name} {count}" for name, count in counts.items()))
         if isinstance(readings, ReadingAssembler):
-            report(f"at the end outputs were {1e3 * (readings.lag_s + late_s):.1f} ms late")
-            report(f"delay of the motion at the end: {1e3 * readings.delay_s:.1f} ms")
+            report(f"output delay at the end: {1e3 * (readings.lag_s + late_s):.1f} ms")
+            report(f"delay of motion behind wrench at the end: {1e3 * readings.delay_s:.1f} ms")
     finally:
         with ExitStack() as stack:
             for each in (wrenches, readings, control_port, changes):

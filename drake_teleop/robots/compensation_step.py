@@ -17,7 +17,7 @@ _MAX_REST_SPECIFIC_FORCE_RMS, _MAX_REST_OMEGA_RMS = 0.1, 0.02  # [m/s^2], [rad/s
 
 @njit(cache=True)
 def reading_problem(values, largest, limits):
-    """Return 0 for a valid reading (15,); 1: not finite, 2: above `largest`, 4: at `limits`."""
+    """Return 0 for a valid reading (15,); 1: not finite, 2: implausible, 4: at sensor range."""
     for i in range(15):
         if not math.isfinite(values[i]):
             return VALUE_NOT_FINITE
@@ -32,7 +32,7 @@ def reading_problem(values, largest, limits):
 
 @njit(cache=True)
 def low_pass_into(x, low_pass, memory):
-    """Filter x (n,) in place by b, a, zi (7,) of `scipy.signal.lfilter`, state `memory` (2, n)."""
+    """Filter x (n,) in place by `low_pass` (7,): b (3), a_1, a_2, zi (2); state `memory` (2, n)."""
     start = math.isnan(memory[0, 0])
     for i in range(len(x)):
         u = x[i]
@@ -51,8 +51,8 @@ def contact_and_scaled_wrench_into(
     """Write contact wrench and scaled wrench of a valid reading `values` (15,) to out (12,).
 
     Row `at` of `rest` (n, 21), for a tare, receives the reading and its unfiltered contact wrench.
-    `gravity` (3,) matters if weight and inertia differ in scale. `no_load` (10,) is 0,
-    `memory` (2, 12) the filter's state; `set_scale_factors_into` sets `scales`.
+    `gravity` (3,): in S; `no_load` (10,): zeros; `scales` (4,): see `set_scale_factors_into`;
+    `low_pass` (7,), or [] for none, with state `memory` (2, 12).
     """
     wrench, s, omega, alpha = values[:6], values[6:9], values[9:12], values[12:]
     contact, scaled = out[:6], out[6:]
@@ -69,7 +69,7 @@ def contact_and_scaled_wrench_into(
 
 @njit(cache=True)
 def set_scale_factors_into(sigma_weight, sigma_inertia, gamma, scales):
-    """Write to `scales` (4,): inertia scale twice, gamma, weight scale minus inertia scale."""
+    """Write to `scales` (4,): inertia scale of two loads, gamma, weight minus inertia scale."""
     scales[0], scales[1], scales[2] = sigma_inertia, sigma_inertia, gamma
     scales[3] = sigma_weight - sigma_inertia
 
@@ -85,7 +85,7 @@ def add_to_statistics(row, count, mean, squares):
 
 @njit(cache=True)
 def update_tare_offsets(count, mean, squares, noise_limits, offsets):
-    """Add the mean contact wrench to the offsets (6,); return 0, or a reason (`TARE_...`)."""
+    """Add the mean contact wrench to `offsets` (6,); return 0, or the reason of a refusal."""
     for i in range(6, 9):
         if squares[i] > count * (_MAX_REST_SPECIFIC_FORCE_RMS * _MAX_REST_SPECIFIC_FORCE_RMS):
             return TARE_IN_MOTION

@@ -34,8 +34,8 @@ MAX_CLOCK_DRIFT = 1e-3
 """Maximum relative drift of two clocks [s/s]."""
 RELATIVE_RATE_TOLERANCE = 0.05
 """Tolerated relative error of the rate, over `_RATE_CHECK_READINGS` and `_RATE_CHECK_S`."""
-TARE_REST_S = 0.5
-"""Time at rest before a tare [s]."""
+TARE_AVERAGING_S = 0.5
+"""Time at rest that a tare averages [s]."""
 SCALE_NAMES = ("sigma", "gamma", "sigma_weight", "sigma_inertia")
 """Arguments of `Compensator.set_scales`."""
 _MAX_FORCE_TORQUE_OFFSET_DRIFT = kernel.MAX_FORCE_OFFSET_DRIFT_N, kernel.MAX_TORQUE_OFFSET_DRIFT_NM
@@ -87,7 +87,7 @@ class Compensator:
     """Converter of readings to contact wrenches and scaled wrenches.
 
     Args:
-        delay_readings: delay of outputs [readings]: that of the motion, which the source removed.
+        delay_readings: delay of the motion, removed by the source; delays outputs [readings].
         predicted: extrapolate over `delay_readings` and the delay of the low-pass.
         sensor_range: (6,) range of the sensor [N, N m].
         scales: arguments of `set_scales`.
@@ -128,7 +128,7 @@ class Compensator:
         self._min_offset = math.inf  # least (now - t)
         self._last_in_time = -math.inf  # arrival of the last reading in time
         self._rate = _ReadingRateCheck(dt)
-        self._tare_rows = np.zeros((max(2, round(TARE_REST_S / dt)), NUM_READING_VALUES + 6))
+        self._tare_rows = np.zeros((max(2, round(TARE_AVERAGING_S / dt)), NUM_READING_VALUES + 6))
         self.good_readings_in_row = 0
         # Load compiled code now; otherwise the first readings would be stale.
         values = np.zeros(NUM_READING_VALUES)
@@ -169,10 +169,10 @@ class Compensator:
         weight = sigma if sigma_weight is None else sigma_weight
         inertia = sigma if sigma_inertia is None else sigma_inertia
         if weight != inertia:
-            self._require_known_weight()
+            self._require_known_weight_and_gravity()
         kernel.set_scale_factors_into(float(weight), float(inertia), float(gamma), self._scales)
 
-    def _require_known_weight(self) -> None:
+    def _require_known_weight_and_gravity(self) -> None:
         if self._weight_removed:
             raise processing.useless_weight_scale_error("load")
         if not self._is_gravity_known:
@@ -213,7 +213,7 @@ class Compensator:
     def tare(self) -> str:
         """Add the mean contact wrench to the offsets, or refuse; return the result as text."""
         if self.good_readings_in_row < len(self._tare_rows):
-            return f"refused: fewer than {TARE_REST_S:g} s of valid readings so far"
+            return f"refused: fewer than {TARE_AVERAGING_S:g} s of valid readings so far"
         problem, step, offsets = self._check_tare_and_calc_new_offsets()
         if problem == kernel.TARE_IN_MOTION:
             return "refused: the sensor moves"
@@ -294,7 +294,7 @@ class Compensator:
     def _contact_and_scaled_wrench(self, values: Array, gravity: Array | None) -> Array:
         self._is_gravity_known = gravity is not None
         if self._scales[3] != 0.0:
-            self._require_known_weight()
+            self._require_known_weight_and_gravity()
         gravity = _ZERO_GRAVITY if gravity is None else gravity
         out = np.empty(12)
         at = self.good_readings_in_row % len(self._tare_rows)

@@ -21,7 +21,7 @@ from drake_teleop.robots.streams import IMU, WRENCH_AND_MOTION, Sink, Source
 from drake_teleop.robots.udp import UdpSink, UdpSource, UdpWrenchPoseSource
 
 _REPLAY_PREFIX = "replay:"
-_UNUSED_RATE_OF_STAMPED_SOURCES_HZ = 1000.0
+_PLACEHOLDER_RATE_HZ = 1000.0
 
 
 def open_source(
@@ -74,7 +74,7 @@ def open_source_and_recorder(
         source = open_source(address, None, real_time=real_time, **motion_options)
         return source, Recorder(sensor_range=sensor_range)
     # Records keep their time stamps; only a NetBox, without stamps, needs its own rate.
-    rate_hz = None if kind == "netft" else _UNUSED_RATE_OF_STAMPED_SOURCES_HZ
+    rate_hz = None if kind == "netft" else _PLACEHOLDER_RATE_HZ
     source = _open_wrench_and_motion_source(address, rate_hz, **motion_options)
     two_clocks = isinstance(source, assembly.WrenchAndMotionStreams) and source.two_clocks
     X_FS = _sensor_pose_from_option(motion_options.get("sensor_pose"))

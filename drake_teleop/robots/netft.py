@@ -128,16 +128,16 @@ def parse_counts_and_rate(content: bytes) -> list[float]:
     counts = [x / _SI_VALUE_OF_SENSOR_UNIT[u] for x, u in zip(per_unit, units, strict=True)]
     values = [*counts, float(text["comrdtrate"])]
     if not all(0.0 < value < 1e12 for value in values):
-        raise ValueError(f"counts and rate {values} are not between 0 and 1e12")
+        raise ValueError(f"counts per N, N m, and rate {values} are not between 0 and 1e12")
     return values
 
 
 _MIN_PERIOD_MEASUREMENT_S, _MAX_PERIOD_MEASUREMENT_S = 1.0, 10.0  # span of our clock
-_MAX_SAMPLE_NUMBER_STEP_S = 1.0  # a larger step of the number is a restart
+_MAX_SAMPLE_GAP_S = 1.0  # a larger step of the number is a restart
 
 
 class SampleClock:
-    """Clock of sample numbers, whose period is `dt` [s] for one second, then the measured one."""
+    """Clock of sample numbers: period `dt` [s] for one second, then measured."""
 
     def __init__(self, dt: float) -> None:
         self._dt = self._period = dt
@@ -147,7 +147,7 @@ class SampleClock:
     def time_of_sample(self, number: int, now: float) -> float:
         """Return the time [s] of a sample received at `now` [s] of a monotonic clock."""
         step = number - self._number
-        if self._first is None or abs(step) * self._dt > _MAX_SAMPLE_NUMBER_STEP_S:
+        if self._first is None or abs(step) * self._dt > _MAX_SAMPLE_GAP_S:
             self._first = number, now
         elif now - self._first[1] >= _MIN_PERIOD_MEASUREMENT_S and number > self._first[0]:
             self._period = (now - self._first[1]) / (number - self._first[0])

@@ -47,7 +47,6 @@ class Recorder:
     A jump of the source's clock starts a new record; the longest one is written.
 
     Args:
-        streams: streams of the source.
         sensor_range: (6,) range of the sensor [N, N m]; None: unknown.
         X_FS: (7,) pose of the sensor in the frame F of the poses.
         two_clocks: whether wrench and motion have different clocks.

@@ -21,7 +21,7 @@ class ReplayLogSource(Source):
     """Source of a log's readings, with the motion aligned to the wrench.
 
     `delay_readings`: removed delay of the motion [readings]; `chunk`: largest number of readings
-    per call. Without a `load` the motion is not aligned.
+    per call; `load` None: the motion is not aligned.
     """
 
     def __init__(

@@ -36,7 +36,7 @@ MESSAGE_TYPE_OF_TOPIC = {
 }
 _STREAM_OF_TOPIC = {"tf": POSE}
 _MAX_TRANSFORM_CHAIN_FRAMES = 64
-SOURCE_PARAMETERS = ("pose", "imu", "joints", "tf", "domain", "sign")
+SOURCE_ADDRESS_PARAMETERS = ("pose", "imu", "joints", "tf", "domain", "sign")
 """Parameters of a source's address."""
 
 
@@ -60,7 +60,7 @@ def checked_topic_name(address: Address, name: str) -> str:
 def topics_frames_and_streams(
     address: Address, joints: tuple[str, ...]
 ) -> tuple[dict[str, str], tuple[str, ...], tuple[str, ...]]:
-    """Return the topics by name, the frames (parent, child) of `tf`, and the streams."""
+    """Return topics by name, frames (parent, child) of `tf`, streams; `joints`: the arm's."""
     topics = {WRENCH: checked_topic_name(address, address.path)}
     for stream in (POSE, IMU, JOINTS):
         if (text := address.optional_parameter(stream)) is not None:
@@ -216,7 +216,7 @@ class Ros2Source(streams.Source):
 
     @delayed_signals()
     def __init__(self, address: str, dt: float, joints: tuple[str, ...] = ()) -> None:
-        parsed = parse_ros2_address(address, SOURCE_PARAMETERS)
+        parsed = parse_ros2_address(address, SOURCE_ADDRESS_PARAMETERS)
         self.dt, sign, domain = dt, parsed.wrench_sign(), domain_of_address(parsed)
         topics, frames, self.streams = topics_frames_and_streams(parsed, joints)
         classes = {name: message_class(MESSAGE_TYPE_OF_TOPIC[name], address) for name in topics}
@@ -288,7 +288,7 @@ class Ros2Sink:
         from rclpy.qos import qos_profile_sensor_data as quality
 
         topic, domain = checked_topic_name(parsed, parsed.path), domain_of_address(parsed)
-        self._which = parsed.wrench_name()
+        self._which = parsed.requested_wrench_name()
         names = "DiagnosticArray", "DiagnosticStatus", "KeyValue"
         types = (WRENCH_STAMPED, *(f"diagnostic_msgs/msg/{name}" for name in names))
         classes = {kind.rpartition("/")[2]: message_class(kind, address) for kind in types}

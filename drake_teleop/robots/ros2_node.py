@@ -18,7 +18,7 @@ from drake_teleop.robots.calibration import DEFAULT_TOLERANCES_TEXT
 from drake_teleop.robots.compensate import run_compensate_command
 from drake_teleop.robots.compensator import SCALE_NAMES, Compensator
 from drake_teleop.robots.ros2 import (
-    SOURCE_PARAMETERS,
+    SOURCE_ADDRESS_PARAMETERS,
     domain_of_address,
     parse_ros2_address,
     shared_node,
@@ -161,7 +161,7 @@ def run_ros2_command(
         if not address.startswith("ros2://"):
             what = "is not an address of a ROS topic"
             raise DrakeTeleopError(what, where=address, remedy="give ros2://TOPIC")
-    node = shared_node(domain_of_address(parse_ros2_address(source, SOURCE_PARAMETERS)))
+    node = shared_node(domain_of_address(parse_ros2_address(source, SOURCE_ADDRESS_PARAMETERS)))
     scales = {k: -1.0 if options.get(k) is None else options[k] for k in SCALE_NAMES}
     served: list[ServedCompensator] = []
 

@@ -16,7 +16,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.ros2 import (
     MESSAGE_TYPE_OF_TOPIC,
-    SOURCE_PARAMETERS,
+    SOURCE_ADDRESS_PARAMETERS,
     WRENCH_STAMPED,
     MessageConverter,
     checked_topic_name,
@@ -85,9 +85,9 @@ def liveliness_tokens(
     ]
 
 
-def make_attachment(number: int, ns: int, sender: bytes) -> bytes:
+def make_attachment(number: int, time_ns: int, sender: bytes) -> bytes:
     """Return number, time [ns] and sender id of a message as bytes (rmw_zenoh since 0.2.4)."""
-    return _ATTACHMENT_FORMAT.pack(number, ns, len(sender), sender)
+    return _ATTACHMENT_FORMAT.pack(number, time_ns, len(sender), sender)
 
 
 def number_in_attachment(attached: bytes) -> int | None:
@@ -138,7 +138,7 @@ class ZenohSource(Source):
     """
 
     def __init__(self, address: str, dt: float, joints: tuple[str, ...] = ()) -> None:
-        parsed = Address(address, DEFAULT_ROUTER_PORT, allowed=SOURCE_PARAMETERS)
+        parsed = Address(address, DEFAULT_ROUTER_PORT, allowed=SOURCE_ADDRESS_PARAMETERS)
         self.dt, sign, domain = dt, parsed.wrench_sign(), domain_of_address(parsed)
         topics, frames, self.streams = topics_frames_and_streams(parsed, joints)
         require_libraries(address)
@@ -178,7 +178,7 @@ class ZenohSink:
     def __init__(self, address: str) -> None:
         parsed = Address(address, DEFAULT_ROUTER_PORT, allowed=("frame", "wrench", "domain"))
         domain, topic = domain_of_address(parsed), checked_topic_name(parsed, parsed.path)
-        self._which = parsed.wrench_name()
+        self._which = parsed.requested_wrench_name()
         require_libraries(address)
         self._types = ros2_type_store()
         self._frame = parsed.optional_parameter("frame") or ""

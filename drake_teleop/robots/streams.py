@@ -55,7 +55,7 @@ class Reading(NamedTuple):
             on the wrist. IMU (6,): specific force and angular velocity of S. JOINTS (n,):
             positions. ACCELERATION (3,): of the tool.
         gravity: (3,) in S [m/s^2]; None without an orientation.
-        arrival: arrival time of a reading of several streams on this computer's clock [s].
+        arrival: arrival time on this computer's clock [s], if a source has several streams.
     """
 
     number: int

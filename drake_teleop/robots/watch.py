@@ -29,12 +29,12 @@ MIN_WRENCH_NOISE_AT_1_KHZ = np.repeat([0.05, 0.0025], 3)
 # Accuracy at which another load would replace the present one.
 _MASS_STD_RATIO_TO_NEVER_REPLACE_LOAD = 1e-12
 # Equivalent noise bandwidth of the zero-phase low-pass over its cut-off: integral of the gain^2.
-_NOISE_BANDWIDTH_OVER_CUTOFF = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
+_NOISE_BANDWIDTH_TO_CUTOFF = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
 
 def white_wrench_noise(load: Identification, dt: float, cutoff_hz: float | None) -> Array:
-    """Return the rms (6,) [N, N m] of white noise that explains the load's filtered residual."""
-    bandwidth_hz = _NOISE_BANDWIDTH_OVER_CUTOFF * (math.inf if cutoff_hz is None else cutoff_hz)
+    """Return the white wrench noise (6,) [N, N m] before the low-pass of the identification."""
+    bandwidth_hz = _NOISE_BANDWIDTH_TO_CUTOFF * (math.inf if cutoff_hz is None else cutoff_hz)
     noise = load.residual_rms / math.sqrt(min(1.0, 2.0 * bandwidth_hz * dt))
     return np.maximum(noise, MIN_WRENCH_NOISE_AT_1_KHZ * math.sqrt(1e-3 / dt))
 
@@ -72,7 +72,7 @@ class ContactAndLoadMonitor:
 
 MEAN_WRENCH_TIME_CONSTANT_S = 3.0
 """Time constant of the mean contact wrench outside of contact [s]."""
-_GRAVITY_CUTOFF_HZ = 0.5
+_GRAVITY_LOW_PASS_CUTOFF_HZ = 0.5
 _CONTACT_STATISTIC_NAME = "level"
 _RELATIVE_FREE_LOG_RATE_TOLERANCE = 0.05
 
@@ -99,10 +99,10 @@ class StreamContactDetector:
             remedy = "use the log that `calibrate` wrote from this stream"
             raise DrakeTeleopError(what, where=str(free), remedy=remedy)
         self._fast = low_pass_coefficients(dt, cutoff_hz)
-        self._slow = low_pass_coefficients(dt, _GRAVITY_CUTOFF_HZ)
+        self._slow = low_pass_coefficients(dt, _GRAVITY_LOW_PASS_CUTOFF_HZ)
         readings = [each for each in source.read(0.0) or () if not each.flags]
         values = np.array([each.values for each in readings]).reshape(-1, 15)
-        transient = round(0.5 / (_GRAVITY_CUTOFF_HZ * dt))  # of the low-passes
+        transient = round(0.5 / (_GRAVITY_LOW_PASS_CUTOFF_HZ * dt))  # of the low-passes
         if len(values) < (required := transient + detection.MIN_NOISE_FLOOR_SAMPLES):
             what = f"has {len(values)} valid readings, too few for a noise floor"
             remedy = f"give a log of free motion with at least {required}"
@@ -113,7 +113,7 @@ class StreamContactDetector:
         contact -= contact[: round(0.5 / dt)].mean(axis=0)  # as a tare
         contact = causal_low_pass(contact, dt, cutoff_hz, ahead_s)
         fast = causal_low_pass(values[:, 6:], dt, cutoff_hz)
-        slow_s = causal_low_pass(values[:, 6:9], dt, _GRAVITY_CUTOFF_HZ)
+        slow_s = causal_low_pass(values[:, 6:9], dt, _GRAVITY_LOW_PASS_CUTOFF_HZ)
         settled = np.hstack([contact, fast, fast[:, :3] - slow_s])[transient:]
         hold = round(1.0 / (cutoff_hz * dt))
         fade = float(np.exp(-1.0 / hold))
@@ -135,20 +135,20 @@ class StreamContactDetector:
         self._memory = detection.ContactDetector.initial_memory()
         self._filters = np.full((2, 12), np.nan)
 
-    def contact_flag(self, values: Array, contact: Array) -> int:
+    def contact_flag(self, values: Array, contact_wrench: Array) -> int:
         """Return `ReadingFlag.IN_CONTACT` or 0 for a reading (15,) and its contact wrench (6,)."""
         settings = self._fast, self._slow, self._filters, self._settings
-        touched = _filter_and_detect_contact(self._memory, values, contact, *settings)
+        touched = _filter_and_detect_contact(self._memory, values, contact_wrench, *settings)
         return int(ReadingFlag.IN_CONTACT) if touched else 0
 
 
 @njit(cache=True)
-def _filter_and_detect_contact(memory, values, contact, fast, slow, filters, settings):
+def _filter_and_detect_contact(memory, values, contact_wrench, fast, slow, filter_states, settings):
     filtered = np.empty(12)
     filtered[:9], filtered[9:] = values[6:], values[6:9]
-    low_pass_into(filtered[:9], fast, filters[:, :9])
-    low_pass_into(filtered[9:], slow, filters[:, 9:])
+    low_pass_into(filtered[:9], fast, filter_states[:, :9])
+    low_pass_into(filtered[9:], slow, filter_states[:, 9:])
     for i in range(3):
         filtered[9 + i] = filtered[i] - filtered[9 + i]
-    s, omega, alpha, acceleration = filtered[:3], filtered[3:6], filtered[6:9], filtered[9:]
-    return detection.update_contact_flag(memory, contact, s, omega, alpha, acceleration, *settings)
+    motion = filtered[:3], filtered[3:6], filtered[6:9], filtered[9:]
+    return detection.update_contact_flag(memory, contact_wrench, *motion, *settings)

@@ -11,7 +11,7 @@ from scipy.ndimage import uniform_filter1d
 
 from drake_teleop.common.blocks import FAULT_WARNINGS, Fault
 from drake_teleop.common.numeric import Array, contact_spans
-from drake_teleop.load.regressor import MIN_LOST_SAMPLE_FLAG_VALUE
+from drake_teleop.load.regressor import LOST_SAMPLE_FLAG_THRESHOLD
 from drake_teleop.station import channel_side, oscillation
 from drake_teleop.station.channel.network import FORWARD, longest_delay, newest_packets
 from drake_teleop.station.master.dynamics import HapticDevice
@@ -106,7 +106,7 @@ def _check_faults(result: SimulationResult) -> Warnings:
 
 def _check_reached_limits(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> Warnings:
     t, flag = result.t, result["saturated"][:, 0]
-    spans = find_spans(t, (flag > 0) & (flag < MIN_LOST_SAMPLE_FLAG_VALUE))
+    spans = find_spans(t, (flag > 0) & (flag < LOST_SAMPLE_FLAG_THRESHOLD))
     yield "the wrist sensor saturates", spans, "move more slowly, or use larger sensor ranges"
     if "ik_status" in result:
         # Fewer than six joints miss a part of nearly each pose; the assumptions contain it.

@@ -20,7 +20,7 @@ from drake_teleop.live.experiment.design import (
     PegInSlot,
 )
 from drake_teleop.live.experiment.procedure import IntervalResult, Procedure, plan_trials
-from drake_teleop.live.experiment.psychometrics import PsiMethod, correct_probability
+from drake_teleop.live.experiment.psychometrics import PsiMethod, correct_answer_probability
 from drake_teleop.live.experiment.store import TrialStore, open_trial_store
 
 SMALL = Experiment(
@@ -48,7 +48,7 @@ def run_participant(procedure: Procedure, rng, threshold: float, most: int = 10_
         elif procedure.phase == "gap":
             procedure.start_second_interval()
         elif procedure.phase == "answer":
-            p = correct_probability(procedure.level, threshold, 1.5, 0.0)
+            p = correct_answer_probability(procedure.level, threshold, 1.5, 0.0)
             signal = procedure.trial.signal_interval
             procedure.store_answer(signal if rng.random() < p else 3 - signal, 0.5)
         else:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.live.experiment.psychometrics import PsiMethod, correct_probability
+from drake_teleop.live.experiment.psychometrics import PsiMethod, correct_answer_probability
 
 
 def test_the_threshold_is_where_d_prime_is_1():
-    assert correct_probability(2.0, 2.0, 1.7, 0.0) == pytest.approx(0.7602, abs=1e-4)
-    assert correct_probability(0.0, 2.0, 1.7, 0.04) == pytest.approx(0.5)
-    assert correct_probability(1e6, 2.0, 1.7, 0.04) == pytest.approx(0.98)
+    assert correct_answer_probability(2.0, 2.0, 1.7, 0.0) == pytest.approx(0.7602, abs=1e-4)
+    assert correct_answer_probability(0.0, 2.0, 1.7, 0.04) == pytest.approx(0.5)
+    assert correct_answer_probability(1e6, 2.0, 1.7, 0.04) == pytest.approx(0.98)
 
 
 def test_next_level_minimises_the_expected_entropy():
@@ -44,7 +44,9 @@ def test_intervals_contain_the_true_thresholds():
         psi = PsiMethod(0.2, 20.0)
         for _ in range(40):
             level = psi.next_level()
-            psi.update_posterior(level, rng.random() < correct_probability(level, truth, 1.5, 0.02))
+            psi.update_posterior(
+                level, rng.random() < correct_answer_probability(level, truth, 1.5, 0.02)
+            )
         found, d = psi.threshold(), psi.estimate_d_prime(truth)
         held.append(found.low <= truth <= found.high and d.low <= 1.0 <= d.high)
         off.append(abs(np.log(found.value / truth)))

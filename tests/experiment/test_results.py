@@ -22,7 +22,7 @@ from drake_teleop.live.experiment.results import (
     compute_results,
     write_results,
 )
-from drake_teleop.live.experiment.simulated import with_interval_seed
+from drake_teleop.live.experiment.simulated import with_noise_seed_of_interval
 from drake_teleop.live.experiment.store import TrialRow, TrialStore
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario
@@ -46,7 +46,7 @@ def test_table_contains_the_true_thresholds(tmp_path):
 
 def test_intervals_have_different_random_numbers():
     seeds = {
-        with_interval_seed(
+        with_noise_seed_of_interval(
             Scenario(),
             SimpleNamespace(
                 num_completed_trials=trial,

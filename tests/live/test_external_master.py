@@ -12,7 +12,7 @@ from drake_teleop.live.hand import (
     _FAULT_INDEX,
     ExternalMaster,
     MakeExternalMasterSide,
-    _update_displayed_wrench,
+    _limit_device_wrench_into,
 )
 from drake_teleop.station.scenario import LoadScenario
 
@@ -25,7 +25,7 @@ def test_force_and_torque_have_their_own_limits_and_slew_rates(limits, wrench):
     wrench, last, shown = np.array(wrench, float), np.zeros(_DISPLAY_STATE_SIZE), []
     for k in range(500):
         now, held = np.empty(_DISPLAY_STATE_SIZE), k < 400
-        _update_displayed_wrench(wrench, held, PERIOD, np.array(limits), last, now)
+        _limit_device_wrench_into(wrench, held, PERIOD, np.array(limits), last, now)
         shown.append(now)
         last = now
     for part, limit in zip((slice(0, 3), slice(3, 6)), limits, strict=True):
@@ -44,7 +44,7 @@ def test_wrench_that_is_not_finite_is_a_fault_and_fades(place, value):
     last, now, wrench = np.zeros(_DISPLAY_STATE_SIZE), np.empty(_DISPLAY_STATE_SIZE), np.ones(6)
     last[0], last[_ALLOWED_SHARE_INDEX] = 2.0, 1.0
     wrench[place] = value
-    _update_displayed_wrench(wrench, True, PERIOD, np.array([4.0, 1.0]), last, now)
+    _limit_device_wrench_into(wrench, True, PERIOD, np.array([4.0, 1.0]), last, now)
     assert now[_FAULT_INDEX] > 0.0
     assert now[_ALLOWED_SHARE_INDEX] == pytest.approx(0.98)
     np.testing.assert_allclose(now[:6], [2.0 - 0.15 * 4.0, 0, 0, 0, 0, 0])

@@ -12,7 +12,7 @@ from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.device_packets import DeviceState, pack_state
 from drake_teleop.live.inputs import INPUT_RANGES, Inputs
 from drake_teleop.live.live import Live
-from drake_teleop.live.motion_limits import MotionLimiter, RateInputs
+from drake_teleop.live.motion_limits import InputRateIntegrator, MotionLimiter
 from drake_teleop.live.scenarios import with_task_space_device
 from drake_teleop.station.scenario import Scenario, replace
 
@@ -102,7 +102,7 @@ def test_keys_move_the_hand_equally_per_simulated_second(scenario, load, slow, r
 
 
 def test_rate_ends_one_second_after_its_last_repetition():
-    steering, inputs = RateInputs(), Inputs()
+    steering, inputs = InputRateIntegrator(), Inputs()
     inputs = steering.set_rates({"x": 1000.0, "sigma": 9.0, "held": 1.0}, inputs, 0.0)
     for k in range(400):
         inputs = steering.advance_inputs(inputs, 5e-3, 5e-3 * k)
@@ -113,7 +113,7 @@ def test_rate_ends_one_second_after_its_last_repetition():
 
 
 def test_reversed_rate_leaves_the_end_of_the_range_at_once():
-    steering, end = RateInputs(), INPUT_RANGES["x"][1]
+    steering, end = InputRateIntegrator(), INPUT_RANGES["x"][1]
     inputs = steering.set_rates({"x": 1e5}, Inputs(), 0.0)
     for k in range(100):
         inputs = steering.advance_inputs(inputs, 5e-3, 5e-3 * k)

@@ -187,7 +187,7 @@ def test_hostile_clients_cannot_end_or_delay_a_drive(scenario, load, monkeypatch
     said = capfd.readouterr()
     assert said.out == "" and set(said.err.splitlines()) == {
         "Prepare the station and its 3D scenes ...",
-        "no page is open: the simulation waits",
+        "simulation waits until a page is open",
     }
 
 

@@ -8,7 +8,7 @@ from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.primitives import SymbolicVectorSystem
 
 from drake_teleop.live.inputs import SLICE_MS
-from drake_teleop.live.session import Session, take_short_steps_in_contact
+from drake_teleop.live.session import Session, take_short_steps_after_rejection
 
 SHORTEST, TICK = 2.5e-4, 5e-4
 
@@ -38,7 +38,7 @@ def ticks(simulator: Simulator, number: int) -> tuple[np.ndarray, np.ndarray]:
 
 def test_after_a_rejected_step_all_are_short_for_4_ms_and_none_is_rejected():
     simulator = ball_on_spring()
-    take_short_steps_in_contact(simulator, SHORTEST)
+    take_short_steps_after_rejection(simulator, SHORTEST)
     taken, rejected = ticks(simulator, 160)
     hits = np.flatnonzero(rejected)
     assert hits.size > 1  # it fell twice
@@ -54,14 +54,14 @@ def test_after_a_rejected_step_all_are_short_for_4_ms_and_none_is_rejected():
 
 def test_no_step_is_longer_than_the_scenarios_limit():
     simulator = ball_on_spring(max_step=1e-4)
-    take_short_steps_in_contact(simulator, SHORTEST)
+    take_short_steps_after_rejection(simulator, SHORTEST)
     taken, _ = ticks(simulator, 60)
     assert taken.min() >= 5
 
 
 def test_monitor_does_not_keep_the_simulator_alive():
     simulator = ball_on_spring()
-    take_short_steps_in_contact(simulator, SHORTEST)
+    take_short_steps_after_rejection(simulator, SHORTEST)
     held = weakref.ref(simulator)
     del simulator
     gc.collect()

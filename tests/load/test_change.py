@@ -17,7 +17,7 @@ from drake_teleop.load.normal_equations import NoiseStd
 from drake_teleop.load.online.change import (
     MIN_NEW_LOAD_AGE_S,
     OBJECT_PRIOR_STD,
-    current_change_state,
+    current_state_index,
     update_change_detector,
 )
 from drake_teleop.load.regressor import non_contact_wrench, regressor
@@ -259,7 +259,7 @@ def test_single_samples_give_the_same_states_as_a_log(bench, tool):
     states = at_once.watch(*rows)
     for k, row in enumerate(zip(*rows, strict=True)):
         update_change_detector(single.memory, np.concatenate([*row, [0.0]]), *single.parameters)
-        assert current_change_state(single.memory) == states[k]
+        assert current_state_index(single.memory) == states[k]
     assert states[-1] == CHANGED
     np.testing.assert_array_equal(single.memory, at_once.memory)
 

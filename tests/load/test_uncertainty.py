@@ -163,10 +163,8 @@ def test_slow_noise_is_reported():
     walk = np.cumsum(white, axis=0) / np.sqrt(len(white))
     drifting = slow(np.where(np.arange(6) == 4, white + 30.0 * walk, white))
     assert drifting.channels_with_slow_noise == ("tau_y",)
-    last = (
-        "drift or slow noise in tau_y: all +- are lower bounds; let the sensor warm up, and record"
-    )
-    assert drifting.text_lines()[-1] == f"{last} again"
+    last = "drift or slow noise in tau_y: uncertainties are lower bounds; let the sensor warm up,"
+    assert drifting.text_lines()[-1] == f"{last} and record again"
     for seed in range(20):
         noise = study.coloured_noise(np.random.default_rng(seed), len(white), "AR(1) 0.9, 1 kHz")
         assert slow(noise).channels_with_slow_noise == ()

@@ -16,7 +16,7 @@ from known_motion import GRAVITY_W, Motion, motion_at, quaternions
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
+from drake_teleop.load.batch.uncertainty import WRENCH_CHANNEL_NAMES
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.explained_log import (
     _correct_wrench_unit_or_torque_scale,
@@ -276,7 +276,7 @@ def test_lines_of_axes_factor_and_gain_compose_with_the_description(
         frame = frame * np.linalg.det(frame)
         channel = int(rng.integers(6))
         record.wrench[:, channel] *= 1.02
-        values = {"channel": CHANNEL_NAMES[channel], "gain": 1.02}
+        values = {"channel": WRENCH_CHANNEL_NAMES[channel], "gain": 1.02}
         causes.append(Finding("gain", "g", values=values))
     scales = rng.choice([-2.0, 1e-4, 1.0], (2, 3))
     record.described(int(rng.choice([-1, 1])), frame, *scales)

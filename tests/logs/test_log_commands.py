@@ -147,7 +147,7 @@ def test_eliminate_returns_the_contact(tmp_path: Path, load: Path) -> None:
     assert np.abs(error[:, 3:]).max() < 0.03
     assert summary["raw_rms"] > 20 > 13 > summary["residual_peak"] > 12
     assert 0.6 < summary["tare_fraction"] < 0.75
-    assert not any("agrees on the sensor's offsets" in note for note in summary["notes"])
+    assert not any("has the same sensor offsets" in note for note in summary["notes"])
     assert summary["gravity_only_rms"] is None
     free = table["t"].to_numpy() < 2.7
     assert np.sqrt(np.mean(np.sum(contact[free, :3] ** 2, axis=1))) < 0.1

@@ -20,7 +20,7 @@ from test_compensator import load
 from test_peers import ADDRESS, peer
 from test_reading_assembly import X_FS, truth
 
-from drake_teleop.cli.calibrate import calibrate_command, make_progress_table
+from drake_teleop.cli.calibrate import calibrate_command, make_progress_display
 from drake_teleop.cli.main import cli
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
@@ -407,7 +407,7 @@ def test_progress_shows_values_and_half_widths_in_their_units() -> None:
     half, none = np.array([0.5, 0.4, 0.6, 0.8]), np.zeros(4, bool)
     at = RecordEvaluation(2.0, found, "", half, half < 1.0, none, (), "")
     console = Console(width=120, record=True, file=io.StringIO())
-    console.print(make_progress_table(at, tolerance))
+    console.print(make_progress_display(at, tolerance))
     text = " ".join(console.export_text().replace("│", "").split())
     for row in ("mass 1.7 0.00425 0.0085 kg", "com x 10 0.2 0.5 mm", "com z 60 0.4 0.5 mm"):
         assert row in text
@@ -417,7 +417,7 @@ def test_a_single_result_within_the_tolerance_is_not_known(tmp_path, monkeypatch
     path, out = tmp_path / "log.parquet", tmp_path / "out"
     evaluate(recorded(3.0, [0, 1, 2]), "mass 1 %", path)
     monkeypatch.setattr("drake_teleop.cli.calibrate.identify_command", lambda *_, **__: {})
-    monkeypatch.setattr("drake_teleop.robots.calibration.FIRST_RECORD_S", 9.0)
+    monkeypatch.setattr("drake_teleop.robots.calibration.MIN_EVALUATED_RECORD_S", 9.0)
     summary = calibrate_command(f"replay:{path}", out, until="mass 50 %", quiet=True)
     assert summary["half_widths_95"]["mass"] < 0.1 and summary["looks"] == 1
     assert summary["known"] == {"mass": False} and not summary["all_known"]

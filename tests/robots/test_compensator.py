@@ -22,7 +22,12 @@ from drake_teleop.logs.processing import eliminate_log
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots import replay_log
 from drake_teleop.robots.compensate import compensate_stream
-from drake_teleop.robots.compensator import MIN_CLOCK_JUMP_S, STALE_AGE_S, TARE_REST_S, Compensator
+from drake_teleop.robots.compensator import (
+    MIN_CLOCK_JUMP_S,
+    STALE_AGE_S,
+    TARE_AVERAGING_S,
+    Compensator,
+)
 from drake_teleop.robots.replay_log import ReplayLogSource
 from drake_teleop.robots.streams import DAMAGED_READING, CompensatedWrench, Reading, ReadingFlag
 
@@ -287,7 +292,7 @@ class RestartCounter:
 def test_detectors_restart_after_silence_and_tare() -> None:
     watch, detector, drift = RestartCounter(), RestartCounter(), np.full(6, 0.01)
     compensator = Compensator(load(), DT, watch=watch, detector=detector)
-    stream = resting(round(TARE_REST_S / DT) + 30, OFFSETS + drift)
+    stream = resting(round(TARE_AVERAGING_S / DT) + 30, OFFSETS + drift)
     for counter in (watch, detector):
         counter.restarts.clear()
     for reading in stream:
@@ -395,7 +400,7 @@ def test_delayed_wrenches_are_clipped() -> None:
      ("wavers", "the wrench varies")],
 )  # fmt: skip
 def test_tare_is_refused_with_a_reason(name: str, reason: str) -> None:
-    compensator, count = Compensator(load(), DT), round(TARE_REST_S / DT)
+    compensator, count = Compensator(load(), DT), round(TARE_AVERAGING_S / DT)
     drift = np.array([0.5, -0.3, 0.2, 0.01, 0.0, 0.02])
     stream = resting(count, OFFSETS + drift)
     if name == "short":

@@ -30,7 +30,7 @@ from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.connections import open_sink
 from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.ros2 import (
-    SOURCE_PARAMETERS,
+    SOURCE_ADDRESS_PARAMETERS,
     MessageConverter,
     checked_topic_name,
     domain_of_address,
@@ -185,11 +185,11 @@ def test_wrong_addresses_are_one_error_line() -> None:
 @pytest.mark.parametrize("query", ["pose=a&tf=b,c", "imu=a&joints=b", "pose=a&imu=b&tf=c,d"])
 def test_only_one_motion_is_accepted(query: str) -> None:
     """Poses of two frames in one stream would be a motion that nothing has."""
-    address = Address(f"zenoh://h/ft?{query}", None, SOURCE_PARAMETERS)
+    address = Address(f"zenoh://h/ft?{query}", None, SOURCE_ADDRESS_PARAMETERS)
     with pytest.raises(DrakeTeleopError, match=r"more than one motion.*give only one of them"):
         topics_frames_and_streams(address, ("joint_1",))
     for part in query.split("&"):
-        one = Address(f"zenoh://h/ft?{part}", None, SOURCE_PARAMETERS)
+        one = Address(f"zenoh://h/ft?{part}", None, SOURCE_ADDRESS_PARAMETERS)
         assert len(topics_frames_and_streams(one, ("joint_1",))[2]) == 2
 
 
@@ -203,12 +203,15 @@ def test_domain_is_that_of_the_address_or_the_environment(
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
     if environment is not None:
         monkeypatch.setenv("ROS_DOMAIN_ID", environment)
-    assert domain_of_address(Address(f"zenoh://h/ft{query}", None, SOURCE_PARAMETERS)) == domain
+    assert (
+        domain_of_address(Address(f"zenoh://h/ft{query}", None, SOURCE_ADDRESS_PARAMETERS))
+        == domain
+    )
 
 
 @pytest.mark.parametrize("name", ["a//b", "a/1b", "1a", "a-b", "", "/", "ä"])
 def test_name_that_no_topic_can_have_is_refused(name: str) -> None:
-    address = Address("zenoh://h/ft", None, SOURCE_PARAMETERS)
+    address = Address("zenoh://h/ft", None, SOURCE_ADDRESS_PARAMETERS)
     with pytest.raises(DrakeTeleopError, match="is not the name of a ROS topic"):
         checked_topic_name(address, name)
     assert checked_topic_name(address, "/a1/_b/c_2/") == "a1/_b/c_2"

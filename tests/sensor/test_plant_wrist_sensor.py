@@ -32,7 +32,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_teleop import AddWristSensor
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.regressor import MIN_LOST_SAMPLE_FLAG_VALUE, non_contact_wrench
+from drake_teleop.load.regressor import LOST_SAMPLE_FLAG_THRESHOLD, non_contact_wrench
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import (
     DISABLED_PART_VALUES,
@@ -290,7 +290,7 @@ def test_a_conversion_to_other_scalars_is_one_line():
 
 def test_outputs_before_the_first_sample_are_flagged():
     run = moving(time_step=1e-3)
-    assert reading(run, "status") == [MIN_LOST_SAMPLE_FLAG_VALUE]
+    assert reading(run, "status") == [LOST_SAMPLE_FLAG_THRESHOLD]
     run.simulator.AdvanceTo(1e-4)
     assert reading(run, "status") == [0.0]
 
@@ -400,7 +400,7 @@ def test_input_not_finite_gives_no_sample():
     values.SetFrom(context.get_discrete_state())
     run.sensor._take_sample_if_due(context, values)
     context.SetDiscreteState(values)
-    assert reading(run, "status")[0] > MIN_LOST_SAMPLE_FLAG_VALUE
+    assert reading(run, "status")[0] > LOST_SAMPLE_FLAG_THRESHOLD
     np.testing.assert_array_equal(reading(run, "measured_wrench_S"), before)
 
 

@@ -12,8 +12,8 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.experiment import design
 from drake_teleop.live.experiment.procedure import IntervalResult
-from drake_teleop.live.inputs import AS_IN_SCENARIO_NAME, INPUT_RANGES, Inputs
-from drake_teleop.live.scenarios import adapt_estimate, live_scenario, scenario_of_inputs
+from drake_teleop.live.inputs import INPUT_RANGES, UNCHANGED_CHOICE, Inputs
+from drake_teleop.live.scenarios import adapt_load_estimate, live_scenario, scenario_of_inputs
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario, replace
@@ -27,16 +27,15 @@ _FORCE_AVERAGING_TIME_S, _MIN_TOUCH_FORCE_N = 0.02, 0.5
 _MAX_SLOT_FLOOR_DISTANCE_M, _MIN_SLOT_FLOOR_TIME_S = 2e-3, 0.2
 
 
-def identify_load_unless_online(scenario: Scenario) -> IdentifiedLoad | None:
+def identify_load_unless_estimated_online(scenario: Scenario) -> IdentifiedLoad | None:
     return None if scenario.load_estimator.enabled else identified_load(scenario)
 
 
 @dataclass(frozen=True, eq=False)
 class Apparatus:
-    """Station of a task under a condition; `base`: scenario of the task without the condition.
+    """Station for a task and a condition; `base`: scenario without the condition.
 
-    `load_mass_at_hand` [kg] is the mass of the load (with `eta`, of the held object) that the hand
-    perceives at scale 1.
+    `load_mass_at_hand`: mass of the load, or with `eta` of the object, scaled for the hand [kg].
     """
 
     task: design.Task
@@ -88,16 +87,16 @@ def make_apparatus(
     changes: dict[str, object] = {f"force_scaling__sigma_{x}": None for x in ("weight", "inertia")}
     if condition.delay is not None:
         changes["channel"] = Channel(delay=condition.delay)
-    elif condition.network != AS_IN_SCENARIO_NAME:
+    elif condition.network != UNCHANGED_CHOICE:
         changes["channel"] = Channel(network=condition.network)
-    if condition.method != AS_IN_SCENARIO_NAME:
+    if condition.method != UNCHANGED_CHOICE:
         changes["passivity__method"] = condition.method
     setup = replace(setup, contact_detection=None, **changes)
     mass = NominalSlave(setup.slave).arm.phi_load[0]
     if condition.eta is not None and setup.slave.payload.mass == 0.0:
         inputs = Inputs.from_scenario(setup).with_changes({"object": 1})
         with_object = scenario_of_inputs(setup, load, inputs)
-        estimate = adapt_estimate(setup, load, with_object)
+        estimate = adapt_load_estimate(setup, load, with_object)
         if load is not None and estimate is not None:
             known = dataclasses.replace(load.identification, offsets=estimate[:6], phi=estimate[6:])
             load = dataclasses.replace(load, identification=known)
@@ -155,14 +154,11 @@ class IntervalLog:
         """Return the largest 20 ms mean of the contact force [N]."""
         return _largest_moving_mean(np.concatenate([np.zeros(1), *self._forces]), self._dt)
 
-    def largest_rendered_force_change(self, after: float) -> float:
-        """Return the largest 20 ms mean of the rendered force's change [N], from `after` [s] on.
-
-        The reference is the mean force of the 0.1 s before.
-        """
+    def largest_rendered_force_change(self, after_s: float) -> float:
+        """Return the largest 20 ms mean of the rendered force [N] minus that before `after_s`."""
         rendered = np.concatenate(self._rendered)
-        start = round(after / self._dt)
-        rest = rendered[round((after - 0.1) / self._dt) : start].mean(axis=0)
+        start = round(after_s / self._dt)
+        rest = rendered[round((after_s - 0.1) / self._dt) : start].mean(axis=0)
         return _largest_moving_mean(np.linalg.norm(rendered[start:] - rest, axis=1), self._dt)
 
 

@@ -7,7 +7,7 @@ from typing import NoReturn, TypeAlias
 from drake_teleop.common.config import check_all_field_values, choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import read_yaml
-from drake_teleop.live.inputs import AS_IN_SCENARIO_NAME, NETWORK_NAMES
+from drake_teleop.live.inputs import NETWORK_NAMES, UNCHANGED_CHOICE
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.scenario import (
@@ -34,12 +34,12 @@ class Condition:
         None, "1", 0.0, 1.0, "scale of a held object's non-contact wrench; requires sigma 0"
     )
     network: str = choice(
-        AS_IN_SCENARIO_NAME,
+        UNCHANGED_CHOICE,
         tuple(name for name in NETWORK_NAMES if name != "custom"),
         "network between master and slave",
     )
     delay: float | None = quantity(None, "s", 0.0, 2.0, "one-way delay; replaces the network")
-    method: str = choice(AS_IN_SCENARIO_NAME, (AS_IN_SCENARIO_NAME,), "passivity method", METHODS)
+    method: str = choice(UNCHANGED_CHOICE, (UNCHANGED_CHOICE,), "passivity method", METHODS)
 
     @property
     def non_contact_scale(self) -> float:
@@ -48,7 +48,7 @@ class Condition:
 
 @dataclass
 class _CommonTaskFields:
-    scenario: str = plain("touch", "shipped name, or a YAML file with a path relative to this file")
+    scenario: str = plain("touch", "scenario: shipped name, or path of a YAML file from here")
     trials: int = quantity(40, "1", 1, 1000, "number of trials of each condition")
     practice: int = quantity(
         4, "1", 0, 100, "number of practice trials, which show the right answer"
@@ -58,7 +58,7 @@ class _CommonTaskFields:
 @settings
 @dataclass
 class ContactDetection(_CommonTaskFields):
-    """Task to identify the interval (of two) with rendered contact; both contain a contact."""
+    """Task to identify the interval (of two) with a rendered force; both contain a contact."""
 
     low: float = quantity(0.2, "N", 1e-3, 1e3, "smallest rendered contact force at the tool")
     high: float = quantity(
@@ -71,7 +71,7 @@ class ContactDetection(_CommonTaskFields):
 @settings
 @dataclass
 class ApparentMass(_CommonTaskFields):
-    """Task to identify the interval (of two) with the heavier tool; the hand moves in both."""
+    """Task to identify the interval (of two) with the heavier tool, while the hand moves."""
 
     low: float = quantity(0.004, "kg", 1e-4, 10.0, "smallest added mass at the hand")
     high: float = quantity(0.15, "kg", 1e-3, 10.0, "largest added mass, also for practice")
@@ -83,7 +83,7 @@ class ApparentMass(_CommonTaskFields):
 class PegInSlot(_CommonTaskFields):
     """Task to insert the tool into a slot; measured: time and contact force."""
 
-    scenario: str = plain("insert", "as in other tasks; its operator needs a task !Insert")
+    scenario: str = plain("insert", "shipped name, or YAML file; its operator needs a task !Insert")
     trials: int = quantity(8, "1", 1, 1000, "number of trials of each condition")
     practice: int = quantity(1, "1", 0, 100, "number of practice trials")
     timeout: float = quantity(30.0, "s", 1.0, 600.0, "time limit; a longer trial has failed")
@@ -118,7 +118,7 @@ class Experiment:
     feedback: str = choice(
         "vibration",
         ("vibration", "bar"),
-        "display of the rendered force: gamepad or haptic device; bar: also a bar on the page",
+        "display of the rendered force; vibration: gamepad or haptic device; bar: also page",
     )
     break_after: int = quantity(40, "1", 1, 10_000, "number of trials between breaks")
     seed: int = quantity(0, "1", 0, 1e9, "random seed")
@@ -149,7 +149,7 @@ class Experiment:
                 fail(f"{place}.name", what, "give each condition its own name")
             if condition.eta is not None and condition.sigma != 0.0:
                 fail(f"{place}.eta", "cannot be combined with sigma > 0", "set sigma: 0")
-            if condition.delay is not None and condition.network != AS_IN_SCENARIO_NAME:
+            if condition.delay is not None and condition.network != UNCHANGED_CHOICE:
                 what = f"cannot be combined with network {condition.network!r}"
                 fail(f"{place}.delay", what, "remove delay or network")
 
@@ -174,5 +174,5 @@ def _load_task_scenario(task: Task, path: Path, index: int) -> Scenario:
         raise DrakeTeleopError(f"{task.scenario} has no slot", where=place, remedy=remedy)
     if isinstance(task, ContactDetection) and scenario.surroundings is None:
         what = f"{task.scenario} has no object to touch"
-        raise DrakeTeleopError(what, where=place, remedy="use a scenario such as touch")
+        raise DrakeTeleopError(what, where=place, remedy="give one with an object, such as touch")
     return scenario

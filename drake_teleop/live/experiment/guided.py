@@ -1,4 +1,4 @@
-"""Event handler that replaces `Live` for the experiment of one participant, and its server."""
+"""Event handler and server for the experiment of one participant."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.experiment.apparatus import Apparatus, IntervalLog
 from drake_teleop.live.experiment.design import PegInSlot
 from drake_teleop.live.experiment.procedure import GAP_PHASE, INTERVAL_PHASE, Procedure
-from drake_teleop.live.experiment.simulated import make_apparatuses, with_interval_seed
+from drake_teleop.live.experiment.simulated import make_apparatuses, with_noise_seed_of_interval
 from drake_teleop.live.inputs import Inputs
 from drake_teleop.live.live import FRAME_PERIOD_S, Live, SceneFunction, parse_message
 from drake_teleop.live.page_scene import PageScene
@@ -42,7 +42,7 @@ HAND_MOTION_INPUTS = ("x", "y", "z", "rx", "ry", "rz", "clutch")
 
 
 class GuidedExperiment:
-    """Event handler of an experiment, with the interface of `Live`; `now`: clock time [s].
+    """Event handler of an experiment for page messages and clock ticks; `now`: clock time [s].
 
     Each interval is a recorded live session. The page receives no force but the rendered one.
     """
@@ -75,15 +75,15 @@ class GuidedExperiment:
             procedure.current_level, procedure.expected_contact_force
         )
         name = f"{procedure.num_completed_trials:04}-{procedure.interval}"
-        setup = with_interval_seed(self._apparatus.scenario, procedure)
+        setup = with_noise_seed_of_interval(self._apparatus.scenario, procedure)
         station = setup, self._apparatus.load, self._drives / name
-        show = self._log_rows_and_return_scene_values
+        show = self._store_rows_and_get_scene_values
         self._live = Live(*station, show, now, self._link, log=False, begin=self._stimulus)
         self._intervals += 1
         if self._driver is not None:
             self._live.join(self._driver, now)
 
-    def _log_rows_and_return_scene_values(self, rows: dict[str, np.ndarray]) -> dict[str, Any]:
+    def _store_rows_and_get_scene_values(self, rows: dict[str, np.ndarray]) -> dict[str, Any]:
         self._rows.add_rows(rows)
         hidden = ("measured_wrench_S", "load_estimate")
         return self._show(rows | {name: np.zeros_like(rows[name]) for name in hidden})
@@ -114,9 +114,9 @@ class GuidedExperiment:
         self._live.leave(self._driver, now)
         self._driver = None
         self._procedure.restart_trial()
-        self._prepare_interval_if_procedure_did(now)
+        self._replace_interval_if_procedure_advanced(now)
 
-    def _prepare_interval_if_procedure_did(self, now: float) -> None:
+    def _replace_interval_if_procedure_advanced(self, now: float) -> None:
         with self._catch_write_error():
             if self._procedure.prepared_intervals != self._prepared:
                 self._live.end_session()
@@ -150,7 +150,7 @@ class GuidedExperiment:
             procedure.advance_phase()
         if (procedure.phase, procedure.num_completed_trials) == before:
             return
-        self._prepare_interval_if_procedure_did(now)
+        self._replace_interval_if_procedure_advanced(now)
         self._phase_start = now
         if procedure.phase == INTERVAL_PHASE:
             self._live.pace.restart(now)
@@ -199,7 +199,7 @@ class GuidedExperiment:
         result = self._apparatus.interval_result(level, self._stimulus, self._rows)
         self._procedure.finish_interval(dataclasses.replace(result, lost_s=live.pace.lost_time_s))
         self._phase_start = self._frame_due = now
-        self._prepare_interval_if_procedure_did(now)
+        self._replace_interval_if_procedure_advanced(now)
 
     def frame(self) -> dict[str, Any]:
         inner = self._live.frame()
@@ -229,7 +229,7 @@ class GuidedExperiment:
 
 
 def parse_experiment_message(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests in a message that participants may make; None without any."""
+    """Return the valid requests of a participant in a message, or None."""
     message = parse_message(text) or {}
     found = {name: message[name] for name in message.keys() & {"drive", "go", "answer"}}
     for kind in message.keys() & {"set", "rates"}:

@@ -87,7 +87,7 @@ class Procedure:
         }
         self._contact_forces: list[float] = []
         for trial, row in zip(self.trials, self._rows, strict=False):
-            self._update_psi_and_contact_forces(trial, row)
+            self._update_psi_method_and_contact_forces(trial, row)
         self.phase, self.is_answer_right, self.is_repeated = CONSENT_PHASE, False, False
         self.prepared_intervals = 0
         self._prepare_trial()
@@ -111,7 +111,7 @@ class Procedure:
 
     @property
     def expected_contact_force(self) -> float:
-        """Median of the participant's contact forces [N]; without any, the task's `pressed`."""
+        """Median of the participant's contact forces [N]; before the first, the task's estimate."""
         task = self.task
         if self._contact_forces:
             return float(np.median(self._contact_forces))
@@ -162,7 +162,7 @@ class Procedure:
         if self.phase == ANSWER_PHASE:
             self._finish_trial(interval, interval == self.trial.signal_interval, time_s)
 
-    def _finish_trial(self, answer: int, correct: bool, time_s: float) -> None:
+    def _finish_trial(self, answer: int, is_correct: bool, time_s: float) -> None:
         trial, results = self.trial, self._results
         row = TrialRow(
             trial=self.num_completed_trials,
@@ -172,21 +172,21 @@ class Procedure:
             level=max(f.level for f in results),
             signal=trial.signal_interval,
             answer=answer,
-            correct=int(correct),
+            correct=int(is_correct),
             time_s=round(time_s, 4),
             force_N=max(f.force_N for f in results),
             lost_s=sum(f.lost_s for f in results),
         )
         self.store.write_rows(self.participant, [*self._rows, row])
         self._rows.append(row)
-        self._update_psi_and_contact_forces(trial, row)
-        self.is_answer_right = bool(correct)
+        self._update_psi_method_and_contact_forces(trial, row)
+        self.is_answer_right = bool(is_correct)
         if trial.practice:
             self.phase = FEEDBACK_PHASE
         else:
             self._start_next_trial()
 
-    def _update_psi_and_contact_forces(self, trial: PlannedTrial, row: TrialRow) -> None:
+    def _update_psi_method_and_contact_forces(self, trial: PlannedTrial, row: TrialRow) -> None:
         if (trial.task, trial.condition) not in self._psi:
             return
         if isinstance(self.experiment.tasks[trial.task], ContactDetection):

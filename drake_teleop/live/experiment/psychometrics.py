@@ -20,11 +20,11 @@ _NUM_GRID_THRESHOLDS = 81
 _GRID_SLOPES = np.geomspace(0.7, 3.0, 7)
 _GRID_LAPSE_RATES = np.array([0.0, 0.02, 0.04, 0.08])
 # Factor of the range of thresholds beyond the range of levels.
-_THRESHOLD_GRID_MARGIN = 2.0
+_THRESHOLD_GRID_FACTOR = 2.0
 _NUM_STIMULUS_LEVELS = 25
 
 
-def correct_probability(level: Array, threshold: Array, slope: Array, lapse: Array) -> Array:
+def correct_answer_probability(level: Array, threshold: Array, slope: Array, lapse: Array) -> Array:
     """Return the probability of a correct two-interval answer at stimulus levels >= 0."""
     return 0.5 * lapse + (1.0 - lapse) * ndtr((level / threshold) ** slope / math.sqrt(2.0))
 
@@ -43,7 +43,7 @@ class PsiMethod:
     def __init__(self, low: float, high: float) -> None:
         self.levels = np.geomspace(low, high, _NUM_STIMULUS_LEVELS)
         self._thresholds = np.geomspace(
-            low / _THRESHOLD_GRID_MARGIN, high * _THRESHOLD_GRID_MARGIN, _NUM_GRID_THRESHOLDS
+            low / _THRESHOLD_GRID_FACTOR, high * _THRESHOLD_GRID_FACTOR, _NUM_GRID_THRESHOLDS
         )
         self._grid = np.ix_(self._thresholds, _GRID_SLOPES, _GRID_LAPSE_RATES)
         shape = (_NUM_GRID_THRESHOLDS, len(_GRID_SLOPES), len(_GRID_LAPSE_RATES))
@@ -53,7 +53,7 @@ class PsiMethod:
         self._p_correct = p_correct.reshape(_NUM_STIMULUS_LEVELS, _NUM_GRID_THRESHOLDS, -1)
 
     def _correct_probability_on_grid(self, level: float) -> Array:
-        return correct_probability(np.float64(level), *self._grid)
+        return correct_answer_probability(np.float64(level), *self._grid)
 
     def next_level(self) -> float:
         """Return the level whose answer minimises the expected entropy of the threshold."""

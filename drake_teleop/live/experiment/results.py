@@ -25,7 +25,7 @@ _PLOTTED_QUANTITIES = (
     "time to the floor [s]",
     "largest contact force [N]",
 )
-_TRIALS_DONE_QUANTITY = "share of trials done"
+_DONE_SHARE_QUANTITY = "share of trials done"
 
 
 class ResultRow(NamedTuple):
@@ -51,20 +51,20 @@ def compute_results(experiment: Experiment, store: TrialStore) -> list[ResultRow
             each: dict[str, list[ResultRow]] = {}
             for n, rows in known.items():
                 done = [r for r in rows if (r.task, r.condition) == (kind, condition.name)]
-                for quantity, estimate in _estimate_quantities(task, done).items():
+                for quantity, estimate in _estimate_task_results(task, done).items():
                     result = ResultRow(kind, condition.name, n, len(done), quantity, *estimate)
                     each.setdefault(quantity, []).append(result)
             for quantity, one in each.items():
                 found += one
                 if len(one) > 1:
-                    values, are_shares = [r.value for r in one], quantity == _TRIALS_DONE_QUANTITY
+                    values, are_shares = [r.value for r in one], quantity == _DONE_SHARE_QUANTITY
                     over = _mean_with_interval(values, are_shares=are_shares)
                     trials = sum(r.trials for r in one)
                     found.append(ResultRow(kind, condition.name, 0, trials, quantity, *over))
     return found
 
 
-def _estimate_quantities(task: Task, rows: Sequence[TrialRow]) -> dict[str, EstimateWithLimits]:
+def _estimate_task_results(task: Task, rows: Sequence[TrialRow]) -> dict[str, EstimateWithLimits]:
     if not rows:
         return {}
     if isinstance(task, PegInSlot):
@@ -73,7 +73,7 @@ def _estimate_quantities(task: Task, rows: Sequence[TrialRow]) -> dict[str, Esti
 
         share = binomtest(len(done), len(rows))
         interval = share.proportion_ci(method="wilson")
-        found = {_TRIALS_DONE_QUANTITY: EstimateWithLimits(share.statistic, *interval)}
+        found = {_DONE_SHARE_QUANTITY: EstimateWithLimits(share.statistic, *interval)}
         if done:
             found["time to the floor [s]"] = _mean_with_interval([row.time_s for row in done])
             found["largest contact force [N]"] = _mean_with_interval([row.force_N for row in done])
@@ -89,7 +89,7 @@ def _estimate_quantities(task: Task, rows: Sequence[TrialRow]) -> dict[str, Esti
 
 
 def _mean_with_interval(values: Sequence[float], *, are_shares: bool = False) -> EstimateWithLimits:
-    """Return the geometric mean (arithmetic for shares) with Student's 95 % interval."""
+    """Return the geometric mean (arithmetic for shares from 0 to 1) with its 95 % interval."""
     x = np.asarray(values) if are_shares else np.log(np.maximum(values, 1e-9))
     mean, half = float(x.mean()), math.nan
     if len(x) > 1:

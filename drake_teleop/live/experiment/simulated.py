@@ -10,7 +10,7 @@ import numpy as np
 from drake_teleop.live.experiment.apparatus import (
     Apparatus,
     IntervalLog,
-    identify_load_unless_online,
+    identify_load_unless_estimated_online,
     make_apparatus,
 )
 from drake_teleop.live.experiment.design import (
@@ -45,13 +45,13 @@ def make_apparatuses(
 ) -> dict[tuple[int, int], Apparatus]:
     apparatuses = {}
     for t, (task, scenario) in enumerate(zip(experiment.tasks, scenarios, strict=True)):
-        load = identify_load_unless_online(scenario)
+        load = identify_load_unless_estimated_online(scenario)
         for c, condition in enumerate(experiment.conditions):
             apparatuses[t, c] = make_apparatus(task, condition, scenario, load)
     return apparatuses
 
 
-def with_interval_seed(scenario: Scenario, procedure: Procedure) -> Scenario:
+def with_noise_seed_of_interval(scenario: Scenario, procedure: Procedure) -> Scenario:
     number = 2 * procedure.num_completed_trials + procedure.interval
     rng = np.random.default_rng([procedure.experiment.seed, procedure.participant, number])
     return replace(scenario, simulation__seed=int(rng.integers(2**32)))
@@ -104,7 +104,7 @@ def answer_by_larger_response(
 def _simulate_response(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalResult, float]:
     task, observer = apparatus.task, procedure.experiment.simulated
     assert not isinstance(task, PegInSlot)
-    session = Session(with_interval_seed(apparatus.scenario, procedure), apparatus.load)
+    session = Session(with_noise_seed_of_interval(apparatus.scenario, procedure), apparatus.load)
     stimulus = apparatus.stimulus_scales(procedure.current_level, procedure.expected_contact_force)
     rows = IntervalLog(apparatus.scenario, None)
     moves_sideways, length = isinstance(task, ApparentMass), task.interval - _HAND_MOTION_START_S
@@ -130,7 +130,7 @@ def _simulate_peg_insertion(apparatus: Apparatus, procedure: Procedure) -> Inter
     task, condition, base = apparatus.task, apparatus.condition, apparatus.base
     assert isinstance(task, PegInSlot) and isinstance(base.operator.task, Insert)
     scenario = replace(
-        with_interval_seed(apparatus.scenario, procedure),
+        with_noise_seed_of_interval(apparatus.scenario, procedure),
         operator__task=base.operator.task,
         simulation__duration=task.timeout,
         simulation__settle=base.simulation.settle,

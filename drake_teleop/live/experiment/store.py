@@ -47,10 +47,10 @@ class TrialRow:
     lost_s: float
 
 
-def table_schema(row: type) -> dict[str, type[pl.DataType]]:
-    """Return the column types of a table whose rows are instances of the class `row`."""
+def table_schema(row_type: type) -> dict[str, type[pl.DataType]]:
+    """Return the column types for rows of the class `row_type`."""
     types: dict[type, type[pl.DataType]] = {int: pl.Int64, float: pl.Float64, str: pl.String}
-    return {name: types[kind] for name, kind in get_type_hints(row).items()}
+    return {name: types[kind] for name, kind in get_type_hints(row_type).items()}
 
 
 _TRIAL_COLUMN_TYPES = table_schema(TrialRow)

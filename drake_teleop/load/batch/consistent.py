@@ -15,8 +15,8 @@ from drake_teleop.load.normal_equations import unidentifiable_mass_error
 
 _PSEUDO_INERTIA_BASIS = [pseudo_inertia(unit) for unit in np.eye(10)]
 _PSEUDO_INERTIA_LMI_MATRICES = [np.zeros((4, 4)), *_PSEUDO_INERTIA_BASIS]
-_PHI_FROM_PSEUDO_INERTIA = np.linalg.pinv(np.reshape(_PSEUDO_INERTIA_BASIS, (10, 16)).T)  # (10, 16)
-_MIN_SCALING_LENGTH_M = 1e-3  # lower bound of the length unit L [m]
+_PSEUDO_INERTIA_TO_PHI = np.linalg.pinv(np.reshape(_PSEUDO_INERTIA_BASIS, (10, 16)).T)  # (10, 16)
+_MIN_LOAD_RADIUS_M = 1e-3  # lower bound of the length unit L [m]
 # Eigenvalues relative to the largest: limit of information, and replacement of smaller ones.
 _MIN_KEPT_EIGENVALUE, _RIDGE_EIGENVALUE = 1e-12, 1e-12
 
@@ -46,12 +46,12 @@ def _natural_scales_of_phi(phi: Array) -> Array:
     if m == 0.0:
         raise unidentifiable_mass_error("the fitted mass is 0")
     spread = max(0.0, 0.5 * (phi[4] + phi[7] + phi[9]) / m)
-    L = max(_MIN_SCALING_LENGTH_M, float(np.linalg.norm(phi[1:4])) / m, np.sqrt(spread))
+    L = max(_MIN_LOAD_RADIUS_M, float(np.linalg.norm(phi[1:4])) / m, np.sqrt(spread))
     return m * np.repeat([1.0, L, L * L], [1, 3, 6])
 
 
 def _solve_consistent_fit(H: Array, b: Array) -> Array:
-    program, x, cone, solver = _cone_program_of_thread(get_ident())
+    program, x, cone, solver = _make_cone_program_for_thread(get_ident())
     cone.UpdateCoefficients(*_distance_cone_coefficients(H, b))
     result = solver.Solve(program)
     if not result.is_success():
@@ -61,11 +61,11 @@ def _solve_consistent_fit(H: Array, b: Array) -> Array:
     # The solver's tolerance leaves eigenvalues of about -1e-9.
     values, vectors = np.linalg.eigh(np.tensordot(result.GetSolution(x), _PSEUDO_INERTIA_BASIS, 1))
     J = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    return np.asarray(_PHI_FROM_PSEUDO_INERTIA @ J.ravel(), np.float64)
+    return np.asarray(_PSEUDO_INERTIA_TO_PHI @ J.ravel(), np.float64)
 
 
 @cache
-def _cone_program_of_thread(thread: int) -> tuple[Any, Any, Any, Any]:
+def _make_cone_program_for_thread(thread_id: int) -> tuple[Any, Any, Any, Any]:
     # Imported here because the rest of the package starts ten times faster without Drake.
     from pydrake.solvers import ClarabelSolver, MathematicalProgram
 
@@ -79,7 +79,7 @@ def _cone_program_of_thread(thread: int) -> tuple[Any, Any, Any, Any]:
 
 
 def _distance_cone_coefficients(H: Array, b: Array) -> tuple[Array, Array]:
-    """Return A, c: A [x; t] + c is in the Lorentz cone if t >= |R x - d|; R^T (R, d) ~ (H, b)."""
+    """Return A, c: A [x; t] + c is in the Lorentz cone if t >= |R x - d|, R^T R ~ H, R^T d ~ b."""
     values, vectors = np.linalg.eigh(H)
     scale = values[-1]
     values = values / scale

@@ -33,9 +33,9 @@ from drake_teleop.load.normal_equations import (
 )
 
 # Smallest noise of a channel, relative to the wrench: rounding in a noise-free record.
-_MIN_NOISE_OVER_RMS = 1e-7
+_MIN_RELATIVE_NOISE = 1e-7
 # Smallest share of the residual's variance that is wrench noise, not noise of the motion.
-_MIN_NOISE_OVER_RESIDUAL_VARIANCE = 0.01
+_MIN_NOISE_SHARE_OF_VARIANCE = 0.01
 # Limits of Huber's weights and of the rejection in robust standard deviations, largest number of
 # fits, and largest number of samples for the median.
 _HUBER_STDS, _REJECTION_STDS, _MAX_ROBUST_FITS, _MAX_MEDIAN_SAMPLES = 3.0, 4.5, 30, 20000
@@ -86,7 +86,7 @@ def _fit_total_least_squares(
         std = np.asarray(noise.wrench, np.float64)
     else:
         std = np.ones(6)
-        floor = _MIN_NOISE_OVER_RMS * np.sqrt(np.diag(Z)[1:7].reshape(2, 3).sum(axis=1)).repeat(3)
+        floor = _MIN_RELATIVE_NOISE * np.sqrt(np.diag(Z)[1:7].reshape(2, 3).sum(axis=1)).repeat(3)
         floor = np.where(floor > 0.0, floor, 1.0)
         for known in (NoiseStd(), noise):
             theta = total_least_squares(moments, known, std, offsets=options.offsets).theta
@@ -96,7 +96,7 @@ def _fit_total_least_squares(
             if options.shared_noise:
                 squares = squares.reshape(2, 3).mean(axis=1).repeat(3)
                 explained = explained.reshape(2, 3).mean(axis=1).repeat(3)
-            variances = np.maximum(squares - explained, _MIN_NOISE_OVER_RESIDUAL_VARIANCE * squares)
+            variances = np.maximum(squares - explained, _MIN_NOISE_SHARE_OF_VARIANCE * squares)
             std = np.sqrt(variances.clip(floor**2))
     solved = total_least_squares(moments, noise, std, offsets=options.offsets)
     return EstimatorFit(solved, std, moments, np.zeros(len(record.s), bool))
@@ -122,7 +122,7 @@ def _fit_robust_least_squares(record: SampleRecord, options: EstimatorOptions) -
     rejected = np.zeros(n, bool)
     for _ in range(_MAX_ROBUST_FITS):
         previous = rejected
-        distances = _largest_residuals_over_robust_std(record, solved.theta, options.shared_noise)
+        distances = _max_normalised_residuals(record, solved.theta, options.shared_noise)
         rejected = distances > _REJECTION_STDS
         moments = SecondMoments()
         moments.add_samples(*record.wrench_and_motion, weights=~rejected)
@@ -140,7 +140,7 @@ def _fit_huber_regression(record: SampleRecord, options: EstimatorOptions) -> So
     for _ in range(_MAX_ROBUST_FITS):
         before = weights
         solved = _fit_total_least_squares(record, options, moments).solved
-        distances = _largest_residuals_over_robust_std(record, solved.theta, options.shared_noise)
+        distances = _max_normalised_residuals(record, solved.theta, options.shared_noise)
         weights = np.minimum(1.0, _HUBER_STDS / np.maximum(distances, _HUBER_STDS))
         if np.abs(weights - before).max() < 0.01:
             break
@@ -149,20 +149,20 @@ def _fit_huber_regression(record: SampleRecord, options: EstimatorOptions) -> So
     return solved
 
 
-def _std_growth_by_rejection(whole: EstimatorFit, kept_moments: SecondMoments) -> float:
+def _std_growth_by_rejection(full_fit: EstimatorFit, kept_moments: SecondMoments) -> float:
     if kept_moments.num_samples < _MIN_SAMPLES_TO_REJECT:
         return np.inf
-    used = excited_columns(whole.moments.mean_products)
+    used = excited_columns(full_fit.moments.mean_products)
     variances = []
-    for moments in (whole.moments, kept_moments):
-        gram, _ = normal_equations(moments.mean_products, whole.solved.weights)
+    for moments in (full_fit.moments, kept_moments):
+        gram, _ = normal_equations(moments.mean_products, full_fit.solved.weights)
         root = root_of_pseudo_inverse(moments.num_samples * gram, used)
         variances.append(np.sum(root**2, axis=1)[used])
     return float(np.sqrt(np.max(variances[1] / variances[0])))
 
 
 class Method(NamedTuple):
-    """Batch estimator: value of `Identification.method`, and function that fits a record."""
+    """Batch estimator: its name in results, and function that fits a record."""
 
     name: str
     fit: Callable[[SampleRecord, EstimatorOptions], EstimatorFit]
@@ -201,10 +201,10 @@ def identify_batch(
     """Return load and sensor offsets of a free motion, fitted by the batch estimator `method`.
 
     Args:
-        wrench, s, omega, alpha, delay_s: as for `identify`.
+        wrench, s, omega, alpha: (N, 6) [N, N m], and (N, 3) motion of sensor frame S [SI].
         noise: noise of wrench and motion; None: estimated wrench noise, exact motion.
         offsets: False if the wrench contains no offsets.
-        shared_noise: True for averages over poses at rest: one noise for forces, one for torques.
+        shared_noise: True for poses at rest: one noise level for forces, one for torques.
         resolution: (2,) quantisation step of forces and torques [N, N m], for `shared_noise` only.
         gain_std: relative standard deviation of the sensor's 36 gains.
     """
@@ -243,14 +243,14 @@ def identify_batch(
     return BatchResult(identification, fit.wrench_noise, fit.rejected, fit.note, equations)
 
 
-def _largest_residuals_over_robust_std(record: SampleRecord, theta: Array, shared: bool) -> Array:
+def _max_normalised_residuals(record: SampleRecord, theta: Array, shared_noise: bool) -> Array:
     n = len(record.s)
     magnitudes = np.abs(record.residual(theta, slice(0, n, max(1, n // _MAX_MEDIAN_SAMPLES))))
     median = np.median(magnitudes, axis=0)
-    if shared:
+    if shared_noise:
         median = np.median(magnitudes.reshape(-1, 2, 3), axis=(0, 2)).repeat(3)
     rms = np.sqrt(np.mean(record.wrench**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
-    scale = np.maximum(_NORMAL_STD_OVER_MEDIAN_DEVIATION * median, _MIN_NOISE_OVER_RMS * rms)
+    scale = np.maximum(_NORMAL_STD_OVER_MEDIAN_DEVIATION * median, _MIN_RELATIVE_NOISE * rms)
     scale = np.where(scale > 0.0, scale, 1.0)
     out = np.empty(n)
     for start in range(0, n, SAMPLES_PER_CHUNK):

@@ -36,7 +36,7 @@ class SolvedNormalEquations(NamedTuple):
     Attributes:
         gram: (16, 16) Gram matrix per sample, without the part due to motion noise.
         weights: (6, 6) weighting matrix of the residual.
-        noise_scale: ratio of residual variance to specified noise variance.
+        noise_scale: ratio of observed to given noise variance.
         map_from_ordinary: (16, 16) matrix that maps the ordinary least squares theta to this one.
     """
 
@@ -73,18 +73,18 @@ def total_least_squares(
 
 
 def _solve_noise_compensated_equations(
-    Z: Array, Q: Array, W: Array, offsets: bool, min_remaining_share: float
+    Z: Array, noise_covariance: Array, W: Array, offsets: bool, min_remaining_share: float
 ) -> SolvedNormalEquations:
     gram, right = normal_equations(Z, W)
     if not offsets:  # without correlation to other columns, their estimate is 0
         gram[:6, 6:] = gram[6:, :6] = 0.0
         right[:6] = 0.0
-    compensation, _ = normal_equations(Q, W)
+    compensation, _ = normal_equations(noise_covariance, W)
     root = root_of_pseudo_inverse(gram, excited_columns(Z))
     # In these coordinates G is the identity; shares are the noise shares of the directions.
     shares, vectors = np.linalg.eigh(root.T @ compensation @ root)
     basis = root @ vectors
-    squares, noise = (float(np.sum(W * moments[1:7, 1:7])) for moments in (Z, Q))
+    squares, noise = (float(np.sum(W * moments[1:7, 1:7])) for moments in (Z, noise_covariance))
     scale = _min_singular_noise_scale(basis.T @ right, shares, squares, noise)
     remaining = 1.0 - scale * shares
     kept = remaining > (min_remaining_share if shares[-1] > 0.0 else 0.0)
@@ -123,7 +123,7 @@ def _min_singular_noise_scale(right: Array, shares: Array, squares: float, noise
 
 @dataclass(frozen=True, eq=False)
 class EstimatorOptions:
-    """Arguments of `identify_batch` that each estimator receives."""
+    """Options of a batch estimator."""
 
     noise: NoiseStd
     offsets: bool = True

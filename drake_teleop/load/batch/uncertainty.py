@@ -27,7 +27,7 @@ from drake_teleop.load.normal_equations import (
 from drake_teleop.load.regressor import regressor
 
 _MAX_DEGREES_OF_FREEDOM = 1e6  # Student's t is then normal to six digits
-CHANNEL_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
+WRENCH_CHANNEL_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 """Names of the wrench channels."""
 
 # Smallest relative eigenvalue of a determined direction (as in `normal_equations`), and largest
@@ -56,7 +56,7 @@ class ParameterCombination:
     Attributes:
         coefficients: (16,) factors, 1 for the leading parameter, which gives the unit.
         leading_index: index of the leading parameter in `PARAMETER_NAMES`.
-        relative_std: standard deviation / |coefficients * `natural_scales`|.
+        relative_std: standard deviation, relative to the typical size for such a load.
         text: the sum as a formula, such as "m c_x + 0.5 f_ox".
     """
 
@@ -77,8 +77,7 @@ class BaseParameters:
     """Combinations of load and offsets that a record determines (Gautier, Khalil, 1990).
 
     Attributes:
-        parameters_without_influence: names of parameters without influence on the wrench.
-        weak_directions: principal combinations of unidentified parameters with finite variance.
+        weak_directions: principal axes of the covariance of unidentified parameters.
         channels_with_slow_noise: names of wrench channels with drift or slow noise.
     """
 
@@ -99,14 +98,14 @@ class BaseParameters:
             share = f"{percent:.0f} % of" if percent < 100.0 else "more than"
             text = f"weak: {c} (+- is {share} the typical size for this load); rotate the load"
             text += " further and faster, about more axes"
-            precise = c.relative_std <= identification.MAX_IDENTIFIED_SCALED_STD
+            precise = c.relative_std <= identification.MAX_IDENTIFIED_RELATIVE_STD
             several = np.count_nonzero(c.coefficients) > 1
             lines.append(f"identified only as a combination: {c}" if several and precise else text)
         if self.channels_with_slow_noise:
             names = ", ".join(self.channels_with_slow_noise)
             lines.append(
-                f"drift or slow noise in {names}: all +- are lower bounds; let the sensor warm up,"
-                " and record again"
+                f"drift or slow noise in {names}: uncertainties are lower bounds; let the sensor"
+                " warm up, and record again"
             )
         return lines
 
@@ -150,7 +149,7 @@ def base_parameters(equations: SecondMoments) -> BaseParameters:
         c[weak] = direction / natural[weak]
         directions.append(scaled_combination(c, int(weak[np.argmax(np.abs(direction))])))
     names = tuple(identification.PARAMETER_NAMES[i] for i in np.flatnonzero(unexcited))
-    slow = tuple(CHANNEL_NAMES[i] for i in np.flatnonzero(equations.has_slow_noise()))
+    slow = tuple(WRENCH_CHANNEL_NAMES[i] for i in np.flatnonzero(equations.has_slow_noise()))
     return BaseParameters(tuple(combinations), names, tuple(directions), slow)
 
 
@@ -221,16 +220,15 @@ def covariance_for_random_walks(
     return inverse @ covariance @ inverse
 
 
-def parameter_errors_by_gains(products: Array, W: Array, inverse: Array) -> Array:
+def parameter_errors_by_gains(products: Array, weights: Array, inverse_gram: Array) -> Array:
     """Return the errors (n, 36) of n parameters for a unit error of each of the 36 sensor gains.
 
-    `products` (B, 6, n, 6): regressor times wrench in B groups; `W` (B, 6, 6): weights; `inverse`
-    (n, n): inverse Gram matrix.
+    `products` (k, 6, n, 6): sums of regressor times wrench in k sets of samples.
     """
-    right = np.einsum("bcd,bcjk->jdk", W, products, optimize=True)  # per gain (d, k)
+    right = np.einsum("bcd,bcjk->jdk", weights, products, optimize=True)  # per gain (d, k)
     length = np.repeat([1.0, GAIN_ERROR_TORQUE_ARM_M], 3)
-    effect = np.einsum("ij,jdk->idk", inverse, right) * (length[:, None] / length)
-    return np.asarray(effect.reshape(len(inverse), 36))
+    effect = np.einsum("ij,jdk->idk", inverse_gram, right) * (length[:, None] / length)
+    return np.asarray(effect.reshape(len(inverse_gram), 36))
 
 
 def covariance_for_gain_errors(fit: EstimatorFit, offsets_estimated: bool) -> Array:
@@ -247,7 +245,7 @@ def covariance_for_gain_errors(fit: EstimatorFit, offsets_estimated: bool) -> Ar
 def covariance_of_solution(
     least_squares_covariance: Array, solved: SolvedNormalEquations, offsets_estimated: bool
 ) -> Array:
-    """Return the covariance (16, 16) of `solved.theta` from that of ordinary least squares."""
+    """Return the covariance (16, 16) of [offsets; phi] from that of ordinary least squares."""
     unknown = np.isinf(np.diag(least_squares_covariance))
     covariance = np.where(unknown[:, None] | unknown, 0.0, least_squares_covariance)
     if not offsets_estimated:

@@ -64,10 +64,10 @@ def _square_of_innovation_sum(memory, last, n):
 def update_statistics(
     memory, contact_wrench, s, omega, alpha, acceleration, parameters, slack, following, quiet_level
 ):
-    """Process one sample: write level, cusum and glr to memory[5:8].
+    """Write level, cusum and glr of one sample to memory[5:8]; `memory` begins with zeros.
 
-    `memory` (MEMORY_SIZE,) is zero at the start, the sample is a row of `DetectorSamples`.
-    `parameters` are `NoiseFloor.compiled_parameters`, `quiet_level` is CONTACT_END_LEVEL.
+    `parameters`: `NoiseFloor.compiled_parameters`; `slack`: of cusum. While level < `quiet_level`,
+    a mean follows the contact wrench by the share `following`, and is subtracted.
     """
     variances, P, growth, root, rho, widths, fade = parameters
     V, scaled = np.empty((6, 10)), np.empty(6)
@@ -112,9 +112,9 @@ def update_statistics(
 
 
 @njit(cache=True)
-def _norm_of_innovation_sum_within_hold(memory, hold, sum_widths):
+def _norm_of_recent_innovation_sum(memory, max_samples, sum_widths):
     m = 0
-    while 2 << m <= min(hold, MAX_GLR_WINDOW_SAMPLES // 2):
+    while 2 << m <= min(max_samples, MAX_GLR_WINDOW_SAMPLES // 2):
         m += 1
     last = int(memory[SAMPLE_COUNT_INDEX]) - 1
     total = _square_of_innovation_sum(memory, last, 1 << m)
@@ -122,19 +122,19 @@ def _norm_of_innovation_sum_within_hold(memory, hold, sum_widths):
 
 
 @njit(cache=True)
-def update_flag_with_hysteresis(memory, statistic, enter, leave, hold, widths):
+def update_flag_with_hysteresis(memory, column, enter, leave, hold, widths):
     """Update the contact flag in `memory` after `update_statistics`; return True in contact.
 
-    Contact begins if statistic 0, 1 or 2 (`statistic`) reaches `enter`; `leave`: CONTACT_END_LEVEL;
-    `hold`: see `ContactDetector`; `widths`: `NoiseFloor.sum_widths`.
+    Contact begins if statistic number `column` reaches `enter`. It ends after more than `hold`
+    samples below `leave`, if the sum of their innovations over its `widths` is below it, too.
     """
     if memory[CONTACT_INDEX] == 0.0:
-        if memory[STATISTICS_START + statistic] >= enter:
+        if memory[STATISTICS_START + column] >= enter:
             memory[CONTACT_INDEX], memory[QUIET_SAMPLES_INDEX] = 1.0, 0.0
     else:
         quiet = memory[QUIET_SAMPLES_INDEX] + 1.0 if memory[STATISTICS_START] < leave else 0.0
         memory[QUIET_SAMPLES_INDEX] = quiet
-        if quiet > hold and _norm_of_innovation_sum_within_hold(memory, hold, widths) < leave:
+        if quiet > hold and _norm_of_recent_innovation_sum(memory, hold, widths) < leave:
             # Reset the sums, because they would decrease too slowly after a long contact. Keep z.
             memory[CONTACT_INDEX] = 0.0
             memory[CUSUM_START:] = 0.0
@@ -187,7 +187,7 @@ class ContactDetector:
         statistic: "level", "cusum" or "glr", see the module.
         hold: contact ends after more than `hold` successive levels below `CONTACT_END_LEVEL`, if
             also the normalised sum of their innovations is below it.
-        following: sample period over time constant of a mean that is subtracted from the contact
+        following: sample period / time constant of a mean that is subtracted from the contact
             wrench, updated while the level is below `CONTACT_END_LEVEL`; 0: no mean.
     """
 
@@ -204,7 +204,7 @@ class ContactDetector:
         enter = float(positive_array("threshold", threshold))
         if not 0.0 <= following < 1.0:
             what = f"{following} is outside the range 0 <= following < 1"
-            raise DrakeTeleopError(what, where="following", remedy="give 0 to subtract no mean")
+            raise DrakeTeleopError(what, where="following", remedy="use following=0 for no mean")
         flag_settings = CUSUM_SLACK, float(following), column, enter, CONTACT_END_LEVEL, int(hold)
         #: Last arguments of `update_contact_flag`.
         self.settings = (floor.compiled_parameters, flag_settings)
@@ -254,7 +254,7 @@ def fit_noise_floor(
     *,
     fade: float = 0.0,
 ) -> NoiseFloor:
-    """Return the noise floor fitted to the arrays of a `DetectorSamples` in free motion."""
+    """Return the noise floor of free motion; `fade`: factor per sample on held accelerations."""
     from scipy.optimize import nnls
 
     rows = validate_detector_samples(contact, s, omega, alpha, acceleration)

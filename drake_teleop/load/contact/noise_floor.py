@@ -70,7 +70,7 @@ class NoiseFloor:
         per_acceleration: (6, 2) factors k [N, N m per m/s^2] and l [per rad/s^2].
         correlation: (6, 6) correlation between channels.
         rho: (6,) correlation of successive samples of the whitened wrench.
-        sum_widths: (8,) scales of sums of n = 1, 2 ... 128 innovations over sqrt(n); 1 if white.
+        sum_widths: (8,) std of sums of n = 1, 2 ... 128 innovations over sqrt(n); 1 if white.
         fade: factor per sample on held maxima of |a|^2 and |alpha|^2; 0: no hold.
         free_maxima: (3,) largest value of each statistic in the fitted motion.
     """
@@ -124,10 +124,10 @@ class NoiseFloor:
 
 @njit(cache=True)
 def noise_variances_into(peaks, s, omega, alpha, acceleration, variances, P, factors, fade, V, out):
-    """Write the variances (6,) of a sample's contact wrench into `out`.
+    """Write the noise variances (6,) of a sample's contact wrench to `out`; `V` (6, 10): scratch.
 
-    `peaks` (2,) are the held |acceleration|^2 and |alpha|^2, which are updated; `V` (6, 10) is
-    scratch memory; others: `NoiseFloor.compiled_parameters`.
+    `peaks` (2,), held |acceleration|^2 and |alpha|^2, decay by `fade`. `variances` (6,): n^2, `P`
+    (16, 16): covariance of [offsets; phi], `factors` (6, 2): k^2, l^2.
     """
     peaks[0] = max(dot(acceleration, acceleration), fade * peaks[0])
     peaks[1] = max(dot(alpha, alpha), fade * peaks[1])
@@ -147,7 +147,7 @@ def noise_variances_into(peaks, s, omega, alpha, acceleration, variances, P, fac
 
 @njit(cache=True)
 def noise_std_into(s, omega, alpha, acceleration, variances, P, factors, fade, out):
-    """Write sigma (N, 6) of N samples to `out`; arguments as for `noise_variances_into`."""
+    """Write the noise sigma (N, 6) of the contact wrench of N samples to `out`."""
     peaks, V, noise = np.zeros(2), np.empty((6, 10)), (variances, P, factors, fade)
     for k in range(s.shape[0]):
         noise_variances_into(peaks, s[k], omega[k], alpha[k], acceleration[k], *noise, V, out[k])

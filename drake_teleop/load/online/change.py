@@ -24,7 +24,7 @@ from drake_teleop.common.vectors import cholesky, copy_into
 from drake_teleop.load import regressor
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.load.online.recursive import MIN_NOISE_TO_PRIOR_VARIANCE, PRIOR_STD
+from drake_teleop.load.online.recursive import MIN_RELATIVE_NOISE_VARIANCE, PRIOR_STD
 
 STATE_NAMES = ("known", "disturbed", "changed", "identified")
 """States of the change detector, by index."""
@@ -34,7 +34,7 @@ DETECTOR_BLOCK_DURATION_S, FILTER_RESTART_INTERVAL_S = 0.016, 2.0
 MIN_NEW_LOAD_AGE_S, MODEL_ERROR_PERSISTENCE_S = 0.2, 0.3
 """Durations [s]: of a block, until a filter restarts, until a new load is accepted, and of a model
 error."""
-MAX_MASS_STD_OVER_CHANGE = 0.0025
+MAX_MASS_STD_TO_MASS_CHANGE = 0.0025
 """Default of `mass_std_ratio`: four standard deviations are 1 % of the change of mass."""
 OFFSET_DRIFT_STD = (0.1,) * 3 + (0.005,) * 3
 """Default standard deviation of the offsets' drift since the identification [N, N m]."""
@@ -48,7 +48,7 @@ _CHI_SQUARED_SLACK, _ALARM_CUSUM, _RETURN_TO_KNOWN_CUSUM = 12.0, 60.0, -30.0
 # Factor of this limit for first moments relative to that of the mass, and smallest size [m].
 _FIRST_MOMENT_BOUND_FACTOR, _MIN_LOAD_SIZE_M = 10.0, 0.03
 # Standard deviations below zero at which the mass of a new load is impossible.
-_MAX_MASS_STDS_BELOW_ZERO = 4.0
+_NEGATIVE_MASS_LIMIT_SIGMAS = 4.0
 
 # Indices into the memory: status; squared residuals of the known and the new load; sums of a block;
 # then [theta (16); P (256)] of the known load, of its filter, and of the new load's filter.
@@ -68,11 +68,10 @@ _NEW_LOAD_COVARIANCE_SLICE = slice(NEW_LOAD_SLICE.stop, MEMORY_SIZE)
 
 
 @njit(cache=True)
-def whitening_matrix(motion, phi, noise, model_var, n):
-    """Return the matrix (6, 6) that maps noise of an n-sample mean wrench to unit covariance.
+def whitening_matrix(motion, phi, noise, relative_error_variance, num_samples):
+    """Return the matrix (6, 6) that maps noise of a mean wrench to unit covariance.
 
-    `motion` (9,) is [s, omega, alpha], `noise` that of `change_detector_parameters`, `model_var`
-    the variance of the load's relative wrench error.
+    `motion` (9,): [s, omega, alpha]; `noise` (>= 15,): variances of one wrench and motion [SI].
     """
     root, N = np.zeros((6, 6)), np.zeros((6, 6))
     above, below, shifted = np.empty(6), np.empty(6), motion.copy()
@@ -81,7 +80,7 @@ def whitening_matrix(motion, phi, noise, model_var, n):
     tau = above[3] ** 2 + above[4] ** 2 + above[5] ** 2
     arm = (phi[1] ** 2 + phi[2] ** 2 + phi[3] ** 2) / max(phi[0] ** 2, 1e-12)
     for c in range(6):
-        N[c, c] = noise[c] + n * model_var * (f if c < 3 else tau + arm * f)
+        N[c, c] = noise[c] + num_samples * relative_error_variance * (f if c < 3 else tau + arm * f)
     for k in range(9):
         if noise[6 + k] == 0.0:
             continue
@@ -94,7 +93,7 @@ def whitening_matrix(motion, phi, noise, model_var, n):
         for i in range(6):
             for j in range(i + 1):
                 N[i, j] += 0.25 * noise[6 + k] * (above[i] - below[i]) * (above[j] - below[j])
-    N /= n
+    N /= num_samples
     cholesky(N, 6)
     for i in range(6):
         for j in range(i + 1):
@@ -106,18 +105,18 @@ def whitening_matrix(motion, phi, noise, model_var, n):
 
 
 @njit(cache=True)
-def update_estimate_by_block_mean(estimate, V, wrench, root):
-    """Update [theta (16); P (256)] by a mean wrench, whitened by `root`; return chi-squared."""
+def update_estimate_by_block_mean(estimate, V, wrench, whitening):
+    """Update `estimate` [theta (16); P (256)] by a mean wrench (6,); return its chi-squared."""
     row, gain = np.empty(16), np.empty(16)
     theta, P, chi = estimate[:16], estimate[16:].reshape(16, 16), 0.0
     for c in range(6):
         innovation = 0.0
         row[:] = 0.0
         for k in range(c + 1):
-            row[k] = root[c, k]
-            innovation += root[c, k] * wrench[k]
+            row[k] = whitening[c, k]
+            innovation += whitening[c, k] * wrench[k]
             for j in range(10):
-                row[6 + j] += root[c, k] * V[k, j]
+                row[6 + j] += whitening[c, k] * V[k, j]
         predicted, uncorrelated = 0.0, 0.0
         for i in range(16):
             innovation -= row[i] * theta[i]
@@ -127,7 +126,7 @@ def update_estimate_by_block_mean(estimate, V, wrench, root):
             gain[i] = value
             predicted += row[i] * value
             uncorrelated += row[i] * row[i] * P[i, i]
-        total = max(1.0, MIN_NOISE_TO_PRIOR_VARIANCE * uncorrelated) + predicted
+        total = max(1.0, MIN_RELATIVE_NOISE_VARIANCE * uncorrelated) + predicted
         chi += innovation * innovation / total
         for i in range(16):
             theta[i] += gain[i] * innovation / total
@@ -137,28 +136,28 @@ def update_estimate_by_block_mean(estimate, V, wrench, root):
 
 
 @njit(cache=True)
-def _update_load_filter_by_block(memory, filter_index, samples_per_block, noise):
-    phi = memory[filter_index + 6 : filter_index + 16].copy()
+def _update_load_filter_by_block(memory, filter_start, samples_per_block, noise):
+    phi = memory[filter_start + 6 : filter_start + 16].copy()
     wrench = memory[_WRENCH_SUM_START:_MOTION_SUM_START]
     motion = memory[_MOTION_SUM_START:_REGRESSOR_SUM_START]
     V = memory[_REGRESSOR_SUM_START:_KNOWN_LOAD_START].reshape(6, 10)
-    before = memory[filter_index : filter_index + 272].copy()
+    before = memory[filter_start : filter_start + 272].copy()
     root = whitening_matrix(motion, phi, noise, noise[15], samples_per_block)
     chi = update_estimate_by_block_mean(before, V, wrench, root)
     if noise[15] == 0.0:
-        copy_into(memory, filter_index, before, 0, 272)
+        copy_into(memory, filter_start, before, 0, 272)
     else:
         root = whitening_matrix(motion, phi, noise, noise[15] * noise[16], samples_per_block)
-        update_estimate_by_block_mean(memory[filter_index : filter_index + 272], V, wrench, root)
+        update_estimate_by_block_mean(memory[filter_start : filter_start + 272], V, wrench, root)
     return chi
 
 
 @njit(cache=True)
-def _restart_filter_from_known_load(memory, filter_index):
-    copy_into(memory, filter_index, memory, _KNOWN_LOAD_START, 272)
-    if filter_index == _NEW_FILTER_START:
+def _restart_filter_from_known_load(memory, filter_start):
+    copy_into(memory, filter_start, memory, _KNOWN_LOAD_START, 272)
+    if filter_start == _NEW_FILTER_START:
         for j in range(10):
-            memory[filter_index + 16 + 17 * (6 + j)] += OBJECT_PRIOR_STD[j] ** 2
+            memory[filter_start + 16 + 17 * (6 + j)] += OBJECT_PRIOR_STD[j] ** 2
         memory[_NEW_LOAD_START_INDEX] = memory[_SAMPLE_COUNT_INDEX]
         memory[_NEW_RESIDUAL_SQUARES_START:_WRENCH_SUM_START] = memory[_ALPHA_SQUARES_INDEX] = 0.0
     memory[_CUSUM_INDEX] = memory[_ESTIMATE_AGE_INDEX] = 0.0
@@ -175,7 +174,7 @@ def _is_new_load_identified(memory, mass_std_ratio):
 
 
 @njit(cache=True)
-def _add_alpha_noise_to_inertia_variances(memory, noise, samples_per_block):
+def _inflate_inertia_variances(memory, noise, samples_per_block):
     theta, P = memory[NEW_LOAD_SLICE], memory[_NEW_LOAD_COVARIANCE_SLICE].reshape(16, 16)
     expected = memory[_ESTIMATE_AGE_INDEX] * (noise[12] + noise[13] + noise[14]) / samples_per_block
     share = min(1.0, expected / max(memory[_ALPHA_SQUARES_INDEX], 1e-300))
@@ -187,11 +186,11 @@ def _add_alpha_noise_to_inertia_variances(memory, noise, samples_per_block):
 
 @njit(cache=True)
 def update_change_detector(memory, sample, block, noise, window, hold, mass_std_ratio):
-    """Update `memory` by a sample (15,); `block` and later: `change_detector_parameters`."""
+    """Update `memory` by a sample (15,); others: results of `change_detector_parameters`."""
     V = np.empty((6, 10))
-    motion = sample[regressor.SAMPLE_MOTION]
+    motion = sample[regressor.MOTION_SLICE]
     regressor.regressor_into(motion[:3], motion[3:6], motion[6:], V)
-    memory[_WRENCH_SUM_START:_REGRESSOR_SUM_START] += sample[regressor.SAMPLE_WRENCH_AND_MOTION]
+    memory[_WRENCH_SUM_START:_REGRESSOR_SUM_START] += sample[regressor.WRENCH_AND_MOTION_SLICE]
     memory[_REGRESSOR_SUM_START:_KNOWN_LOAD_START] += V.ravel()
     memory[_SAMPLE_COUNT_INDEX] += 1.0
     memory[_BLOCK_SAMPLES_INDEX] += 1.0
@@ -239,14 +238,14 @@ def _update_change_state_by_block(memory, block, noise, window, hold, mass_std_r
     # A clearly negative mass is not a load.
     mass = memory[_NEW_FILTER_START + 6]
     deviation = math.sqrt(memory[_NEW_FILTER_START + 16 + 17 * 6])
-    if memory[_CUSUM_INDEX] > _ALARM_CUSUM or mass < -_MAX_MASS_STDS_BELOW_ZERO * deviation:
+    if memory[_CUSUM_INDEX] > _ALARM_CUSUM or mass < -_NEGATIVE_MASS_LIMIT_SIGMAS * deviation:
         memory[_STATE_INDEX] = STATE_DISTURBED
         _restart_filter_from_known_load(memory, _NEW_FILTER_START)
     elif memory[_STATE_INDEX] == STATE_DISTURBED and memory[_ESTIMATE_AGE_INDEX] >= hold:
         memory[_STATE_INDEX] = STATE_CHANGED
     elif memory[_STATE_INDEX] == STATE_CHANGED and _is_new_load_identified(memory, mass_std_ratio):
         memory[_STATE_INDEX] = memory[_BASE_STATE_INDEX] = STATE_IDENTIFIED
-        _add_alpha_noise_to_inertia_variances(memory, noise, block)
+        _inflate_inertia_variances(memory, noise, block)
         copy_into(memory, _KNOWN_LOAD_START, memory, _NEW_FILTER_START, 272)
         memory[_IDENTIFIED_SAMPLES_INDEX] = memory[_ESTIMATE_AGE_INDEX] * block
         share = block / memory[_ESTIMATE_AGE_INDEX]
@@ -277,13 +276,13 @@ def change_detector_parameters(
     """Return block length [samples], noise (17,), window and hold [blocks], mass_std_ratio.
 
     `noise`: variances of wrench, motion and relative wrench error, duration of that error [blocks].
-    `window`: time until the filter restarts; `hold`: time until a new load is accepted.
+    A filter restarts after `window`; a new load is accepted after `hold`.
 
     Args:
         wrench_std, motion_std: (6,), (9,) roots of the long-run variances of `SecondMoments` [SI].
         period: time between samples [s].
         relative_wrench_error: relative error of the load's wrench.
-        mass_std_ratio: required standard deviation of a new load's mass over the change of mass.
+        mass_std_ratio: required standard deviation of a new mass / change of mass.
     """
     positive_array("period", period)
     if not 0.0 <= relative_wrench_error < 1.0:
@@ -291,7 +290,7 @@ def change_detector_parameters(
         remedy = "give the relative error of the wrench"
         raise DrakeTeleopError(what, where="relative_wrench_error", remedy=remedy)
     if mass_std_ratio is None:
-        mass_std_ratio = max(MAX_MASS_STD_OVER_CHANGE, 2.0 * relative_wrench_error)
+        mass_std_ratio = max(MAX_MASS_STD_TO_MASS_CHANGE, 2.0 * relative_wrench_error)
     positive_array("mass_std_ratio", mass_std_ratio)
     block = max(1, round(DETECTOR_BLOCK_DURATION_S / period))
     window, hold, memory = (
@@ -328,8 +327,8 @@ def initial_change_memory(
 
 
 @njit(cache=True)
-def current_change_state(memory):
-    """Return the index of the state in `STATE_NAMES`, with "known" instead of "identified"."""
+def current_state_index(memory):
+    """Return the index in `STATE_NAMES`; "known" also if the known load was identified here."""
     is_known = memory[_STATE_INDEX] == memory[_BASE_STATE_INDEX]
     return STATE_KNOWN if is_known else int(memory[_STATE_INDEX])
 
@@ -355,7 +354,7 @@ def detector_states_of_log(
 
 
 def identified_or_known_load(memory: Array, known: Identification) -> Identification:
-    """Return the last new load that the detector identified, or `known` if there is none."""
+    """Return the last load that the detector identified, or `known`."""
     if memory[_BASE_STATE_INDEX] == STATE_KNOWN:
         return known
     theta = memory[KNOWN_LOAD_SLICE].copy()

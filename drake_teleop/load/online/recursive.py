@@ -15,11 +15,11 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, broadcast_to_rows, positive_array
 from drake_teleop.load.batch.uncertainty import is_prior_dominated
 from drake_teleop.load.identification import (
-    MAX_IDENTIFIED_SCALED_STD,
+    MAX_IDENTIFIED_RELATIVE_STD,
     Identification,
     is_precise_enough,
 )
-from drake_teleop.load.regressor import SAMPLE_MOTION, SAMPLE_WRENCH, regressor_into
+from drake_teleop.load.regressor import MOTION_SLICE, WRENCH_SLICE, regressor_into
 
 PRIOR_STD = (100.0,) * 3 + (10.0,) * 3 + (10.0,) + (3.0,) * 3 + (1.0,) * 6
 """Standard deviations of the default prior about zero [N, N m, kg, kg m, kg m^2]."""
@@ -31,14 +31,14 @@ MAX_SETTLED_RELATIVE_STD = 0.05
 _MIN_RELATIVE_INFORMATION_EIGENVALUE = 1e-16
 # Smallest variance of a row relative to the sum of its terms; rounding would make P indefinite. It
 # slows only the first samples of sensors with noise below about 1 mN (for the default prior).
-MIN_NOISE_TO_PRIOR_VARIANCE = 1e-10
+MIN_RELATIVE_NOISE_VARIANCE = 1e-10
 
 
 @njit(cache=True)
 def rls_update(theta, P, samples, noise_std, forgetting, max_variances, residual_square_sums):
     """Update theta (16,), covariance P (16, 16) and `residual_square_sums` (6,) by N samples.
 
-    Values are not checked. `max_variances` (16,) limits the variances during forgetting.
+    `max_variances` (16,) limits the variances during forgetting.
     """
     V, gain = np.empty((6, 10)), np.empty(16)
     step = 1.0 / math.sqrt(forgetting)
@@ -53,7 +53,7 @@ def rls_update(theta, P, samples, noise_std, forgetting, max_variances, residual
             for c in range(6):
                 residual_square_sums[c] *= forgetting
 
-        wrench, motion = sample[SAMPLE_WRENCH], sample[SAMPLE_MOTION]
+        wrench, motion = sample[WRENCH_SLICE], sample[MOTION_SLICE]
         regressor_into(motion[:3], motion[3:6], motion[6:], V)
         for c in range(6):
             first, last = (0, 4) if c < 3 else (1, 10)
@@ -70,7 +70,7 @@ def rls_update(theta, P, samples, noise_std, forgetting, max_variances, residual
                 innovation -= v * theta[6 + j]
                 predicted += v * gain[6 + j]
                 uncorrelated += v * v * P[6 + j, 6 + j]
-            variance = max(noise_std[c] * noise_std[c], MIN_NOISE_TO_PRIOR_VARIANCE * uncorrelated)
+            variance = max(noise_std[c] * noise_std[c], MIN_RELATIVE_NOISE_VARIANCE * uncorrelated)
             inverse = 1.0 / (variance + predicted)
             share = innovation * inverse
             residual_square_sums[c] += variance * innovation * share
@@ -89,7 +89,7 @@ class RecursiveEstimator(ABC):
     Args:
         noise_std: (6,) standard deviations of the wrench channels [N, N m].
         forgetting: factor per sample on the weight of past samples, 0 < forgetting <= 1.
-        prior_std: (16,) standard deviations of the prior; an upper bound during forgetting.
+        prior_std: (16,) standard deviations of the prior; forgetting does not exceed them.
         settled_std: largest standard deviation for `is_settled`, relative to `natural_scales`.
     """
 
@@ -199,7 +199,7 @@ class RecursiveEstimator(ABC):
             phi=self.phi,
             offsets=self.offsets,
             covariance=covariance,
-            identifiable=self._are_identified(deviations, self._theta, MAX_IDENTIFIED_SCALED_STD),
+            identifiable=self._are_identified(deviations, self._theta, MAX_IDENTIFIED_RELATIVE_STD),
             condition_number=self._condition_number(),
             delay_s=0.0,
             residual_rms=self._residual_rms(),
@@ -209,7 +209,7 @@ class RecursiveEstimator(ABC):
         )
 
     def _are_identified(self, deviations: Array, theta: Array, max_std: float) -> NDArray[np.bool_]:
-        scaled = deviations * (MAX_IDENTIFIED_SCALED_STD / max_std)
+        scaled = deviations * (MAX_IDENTIFIED_RELATIVE_STD / max_std)
         from_data = ~is_prior_dominated(deviations, np.sqrt(self._prior))
         return from_data & is_precise_enough(scaled, theta[6:])
 

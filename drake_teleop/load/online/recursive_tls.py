@@ -21,17 +21,17 @@ from drake_teleop.common.numeric import Array, nonnegative_array
 from drake_teleop.common.registry import Registry
 from drake_teleop.load.normal_equations import regressor_coefficients
 from drake_teleop.load.online.recursive import RecursiveEstimator, RecursiveLeastSquares
-from drake_teleop.load.regressor import SAMPLE_MOTION, SAMPLE_WRENCH
+from drake_teleop.load.regressor import MOTION_SLICE, WRENCH_SLICE
 
 # Relative increase of diagonal elements against rounding.
 RELATIVE_RIDGE = 1e-13
 # Indices of the wrench and of the products w_i w_j in z, and z in the order of `normal_equations`.
-_WRENCH_START_IN_Z, _OMEGA_PRODUCTS_IN_Z = 13, np.array([[7, 10, 11], [10, 8, 12], [11, 12, 9]])
-_Z_INDICES_IN_BATCH_ORDER = [0, *range(7, 19), *range(1, 7)]
+_WRENCH_START_IN_Z, _OMEGA_PRODUCT_INDICES = 13, np.array([[7, 10, 11], [10, 8, 12], [11, 12, 9]])
+_BATCH_INDEX_OF_Z = [0, *range(7, 19), *range(1, 7)]
 # Smallest excess of information over noise after compensation, in units of sqrt(2 / samples).
-_MIN_COMPENSATED_INFORMATION_EXCESS = 4.0
+_MIN_INFORMATION_EXCESS_SIGMAS = 4.0
 # Smallest pivot relative to its diagonal element that is not rounding.
-_MIN_PIVOT_OVER_DIAGONAL = 1e-13
+_MIN_RELATIVE_PIVOT = 1e-13
 # Fewest samples for the noise scale from residuals.
 _MIN_SAMPLES_FOR_NOISE_SCALE = 20
 
@@ -39,25 +39,25 @@ _MIN_SAMPLES_FOR_NOISE_SCALE = 20
 @cache
 def nonzero_regressor_terms() -> tuple[NDArray[np.uintp], Array]:
     """Return nonzero terms of T, [E V] = T z: indices (n, 3) of channel, z, parameter; factors."""
-    T = regressor_coefficients()[:, :, _Z_INDICES_IN_BATCH_ORDER].swapaxes(1, 2)
+    T = regressor_coefficients()[:, :, _BATCH_INDEX_OF_Z].swapaxes(1, 2)
     index = np.argwhere(T)
     # Unsigned, so that the compiled loops do not check for negative indices.
     return np.ascontiguousarray(index, dtype=np.uintp), T[tuple(index.T)]
 
 
 @njit(cache=True)
-def allocate_scratch():
+def allocate_work_arrays():
     E, g, inverse = np.empty((13, 6, 16)), np.empty(16), np.empty((6, 12))
     return E, g, np.empty((6, 19)), np.empty((6, 19)), inverse, np.empty((6, 6)), np.empty((6, 6))
 
 
 @njit(cache=True)
-def write_products_vector(wrench, motion, z):
+def write_moment_vector(wrench, motion, z):
     omega = motion[3:6]
     z[0], z[1:4], z[4:7], z[_WRENCH_START_IN_Z:] = 1.0, motion[:3], motion[6:], wrench
     for i in range(3):
         for j in range(i + 1):
-            z[_OMEGA_PRODUCTS_IN_Z[i, j]] = omega[i] * omega[j]
+            z[_OMEGA_PRODUCT_INDICES[i, j]] = omega[i] * omega[j]
 
 
 @njit(cache=True)
@@ -68,14 +68,14 @@ def add_outer_product(y, z, total):
 
 
 @njit(cache=True)
-def discount_samples_and_recentre_prior(memory, theta, information, forgetting):
+def discount_samples_and_set_prior_to_theta(memory, theta, information, forgetting):
     memory[:-1] *= forgetting
     memory[-1, :16] = information * theta
 
 
 @njit(cache=True)
 def write_residual_products(Z, theta, index, factors, L, LZ, S):
-    """Write L, LZ = L Z and S = L Z L^T (6, 6), where r = F - [E V] theta = L z is the residual."""
+    """Write L, LZ = L Z, S = L Z L^T (6, 6), of the residual F - [E V] theta = L z (terms of T)."""
     L[:] = 0.0
     LZ[:] = 0.0
     for c in range(6):
@@ -108,26 +108,26 @@ def write_noise_products(Z, noise_std, motion_std, Q):
         # The derivative of w_i w_k by w_k is w_i, or 2 w_i for i = k.
         for i in range(3):
             for j in range(3):
-                both = (1.0 + (i == k)) * (1.0 + (j == k)) * Z[0, _OMEGA_PRODUCTS_IN_Z[i, j]]
-                row, column = _OMEGA_PRODUCTS_IN_Z[i, k], _OMEGA_PRODUCTS_IN_Z[j, k]
+                both = (1.0 + (i == k)) * (1.0 + (j == k)) * Z[0, _OMEGA_PRODUCT_INDICES[i, j]]
+                row, column = _OMEGA_PRODUCT_INDICES[i, k], _OMEGA_PRODUCT_INDICES[j, k]
                 Q[row, column] += motion_std[3 + k] ** 2 * both
 
 
 @njit(cache=True)
-def write_weighted_gram(Z, W, index, factors, E, G, first):
-    """Write the sum of [E V](y)^T W [E V](z) to G[:, first:]; Z (19, 19) is the sum of y z^T."""
+def write_weighted_gram(Z, W, index, factors, E, G, first_column):
+    """Write sum of [E V](y)^T W [E V](z) to G[:, first_column:], from Z, the sum of y z^T."""
     E[:] = 0.0
     for t in range(len(factors)):
         c, b, k, factor = index[t, 0], index[t, 1], index[t, 2], factors[t]
         for a in range(13):
             E[a, c, k] += factor * Z[a, b]
-    G[:, first : first + 16] = 0.0
+    G[:, first_column : first_column + 16] = 0.0
     for t in range(len(factors)):
         c, a, j, factor = index[t, 0], index[t, 1], index[t, 2], factors[t]
         w0, w1, w2 = factor * W[c, 0], factor * W[c, 1], factor * W[c, 2]
         w3, w4, w5 = factor * W[c, 3], factor * W[c, 4], factor * W[c, 5]
         for k in range(16):
-            G[j, first + k] += (
+            G[j, first_column + k] += (
                 (w0 * E[a, 0, k] + w1 * E[a, 1, k])
                 + (w2 * E[a, 2, k] + w3 * E[a, 3, k])
                 + (w4 * E[a, 4, k] + w5 * E[a, 5, k])
@@ -136,7 +136,7 @@ def write_weighted_gram(Z, W, index, factors, E, G, first):
 
 @njit(cache=True)
 def write_weighted_right_side(LZ, W, index, factors, g):
-    """Write the sum of [E V](z)^T W F over samples to g (16,); LZ (6, 19) is the sum of F z^T."""
+    """Write the sum of [E V](z)^T W F to g (16,), from LZ (6, 19), the sum of F z^T."""
     g[:] = 0.0
     for t in range(len(factors)):
         c, a = index[t, 0], index[t, 1]
@@ -147,7 +147,7 @@ def write_weighted_right_side(LZ, W, index, factors, g):
 
 
 @njit(cache=True)
-def eliminate_rows(A):
+def eliminate_below_diagonal(A):
     """Replace A = [S B] by [D L^T, L^-1 B], for symmetric S = L D L^T (n, n)."""
     n, m = A.shape
     for k in range(n):
@@ -165,7 +165,7 @@ def solve_augmented_system_in_place(A):
     n, m = A.shape
     for i in range(n):
         A[i, i] *= 1.0 + RELATIVE_RIDGE
-    eliminate_rows(A)
+    eliminate_below_diagonal(A)
     for i in range(n - 1, -1, -1):
         for j in range(n, m):
             x = A[i, j] / A[i, i]
@@ -185,7 +185,7 @@ def write_inverse_6x6(S, A, W):
 
 
 class MomentEstimator(RecursiveEstimator):
-    """Recursive estimator with memory (20, 19): sum of z z^T, Eq. (T18), and row of the prior."""
+    """Recursive estimator with memory (20, 19): sum of z z^T, Eq. (T18), and prior row."""
 
     def initial_memory(self, theta: Array) -> Array:
         memory = np.zeros((20, 19))
@@ -205,15 +205,15 @@ class MomentEstimator(RecursiveEstimator):
 
 @njit(cache=True)
 def select_compensated_parameters(G, N, noise_scale, K, subtract):
-    """Set `subtract` (16,) to 1 for parameters whose noise part N can be removed from G, else 0."""
+    """Set `subtract` (16,) to 1 if the noise part N can be removed from G, else 0; K: scratch."""
     subtract[:] = 1.0
     for i in range(16):
         for j in range(16):
             K[i, j] = G[i, j] - noise_scale * N[i, j]
-    eliminate_rows(K)
+    eliminate_below_diagonal(K)
     definite = True
     for i in range(16):
-        definite &= K[i, i] > _MIN_PIVOT_OVER_DIAGONAL * G[i, i]
+        definite &= K[i, i] > _MIN_RELATIVE_PIVOT * G[i, i]
     if definite:
         return
     for i in range(16):
@@ -227,9 +227,9 @@ def select_compensated_parameters(G, N, noise_scale, K, subtract):
             total = G[i, i] - noise_scale * subtract[i] * N[i, i]
             for k in range(i):
                 total -= K[i, k] * K[i, k]
-            if total > _MIN_PIVOT_OVER_DIAGONAL * G[i, i]:
+            if total > _MIN_RELATIVE_PIVOT * G[i, i]:
                 break
-        if not total > _MIN_PIVOT_OVER_DIAGONAL * G[i, i]:
+        if not total > _MIN_RELATIVE_PIVOT * G[i, i]:
             subtract[:] = 0.0
             return
         K[i, i] = math.sqrt(total)
@@ -262,21 +262,21 @@ def rtls_update(
     """Update theta (16,) and memory (20, 19) of recursive total least squares by N samples.
 
     `noise_std` (6,) is of the wrench, `motion_std` (9,) of [s, omega, alpha]; `information` (16,)
-    contains inverse variances of the prior.
+    are inverse prior variances; `index`, `factors`: `nonzero_regressor_terms`.
     """
-    scratch, Q, z, subtract = allocate_scratch(), np.empty((19, 19)), np.empty(19), np.empty(16)
+    scratch, Q, z, subtract = allocate_work_arrays(), np.empty((19, 19)), np.empty(19), np.empty(16)
     G, N, K = np.empty((16, 17)), np.empty((16, 16)), np.empty((16, 16))
     Z, options = memory[:19], (noise_std, motion_std, index, factors)
     for n in range(len(samples)):
         if forgetting < 1.0:
-            discount_samples_and_recentre_prior(memory, theta, information, forgetting)
-        write_products_vector(samples[n, SAMPLE_WRENCH], samples[n, SAMPLE_MOTION], z)
+            discount_samples_and_set_prior_to_theta(memory, theta, information, forgetting)
+        write_moment_vector(samples[n, WRENCH_SLICE], samples[n, MOTION_SLICE], z)
         add_outer_product(z, z, Z)
         scale = write_rtls_normal_equations(Z, theta, *options, scratch, Q, G, N)
         for i in range(16):
             G[i, i] += information[i]
             G[i, 16] += memory[19, i]
-        gain = 1.0 - _MIN_COMPENSATED_INFORMATION_EXCESS * math.sqrt(2.0 / Z[0, 0])
+        gain = 1.0 - _MIN_INFORMATION_EXCESS_SIGMAS * math.sqrt(2.0 / Z[0, 0])
         if gain > 0.0:
             select_compensated_parameters(G, N, scale / gain, K, subtract)
             for i in range(6, 16):
@@ -314,8 +314,8 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         shares, vectors = np.linalg.eigh(scale * root @ N @ root.T)
         directions = root.T @ vectors
         excess = 1.0 - shares
-        min_excess = _MIN_COMPENSATED_INFORMATION_EXCESS * math.sqrt(2.0 / max(samples, 1.0))
-        excited = (shares < _MIN_PIVOT_OVER_DIAGONAL) | (excess > min_excess)
+        min_excess = _MIN_INFORMATION_EXCESS_SIGMAS * math.sqrt(2.0 / max(samples, 1.0))
+        excited = (shares < _MIN_RELATIVE_PIVOT) | (excess > min_excess)
         inverse = (directions[:, excited] / excess[excited]) @ directions[:, excited].T
         factor = inverse @ _regularized_cholesky(scale * G + information)
         unknown = directions[:, ~excited]
@@ -326,7 +326,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         G, N, Q = np.zeros((16, 17)), np.zeros((16, 16)), np.empty((19, 19))
         if not memory[0, 0] > 0.0:
             return G[:, :16], N, 1.0
-        noise, scratch = (self._noise_std, self._motion_std), allocate_scratch()
+        noise, scratch = (self._noise_std, self._motion_std), allocate_work_arrays()
         options = *noise, *nonzero_regressor_terms(), scratch, Q
         scale = write_rtls_normal_equations(memory[:19], theta, *options, G, N)
         return G[:, :16], N, scale if memory[0, 0] > _MIN_SAMPLES_FOR_NOISE_SCALE else 1.0
@@ -337,7 +337,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
 
 
 def _regularized_cholesky(A: Array) -> Array:
-    return np.asarray(np.linalg.cholesky(A + _MIN_PIVOT_OVER_DIAGONAL * np.diag(np.diag(A))))
+    return np.asarray(np.linalg.cholesky(A + _MIN_RELATIVE_PIVOT * np.diag(np.diag(A))))
 
 
 METHODS: Registry[type[RecursiveEstimator]] = Registry(

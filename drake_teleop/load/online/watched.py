@@ -24,7 +24,7 @@ STATE_LEARNING, STATE_SETTLED, STATE_DISTURBED, STATE_OTHER_LOAD = range(4)
 LOAD_FADE_TIME_S, MIN_REST_TIME_S, OFFSET_TIME_CONSTANT_S, MIN_CHANGE_TIME_S = 0.1, 0.3, 3.0, 0.1
 """Durations [s]: cross-fade, rest before offsets follow residuals, time constant of the offsets,
 and explanation of a changed force by a new load."""
-MAX_RESIDUAL_OF_OFFSET_DRIFT = np.array([0.3] * 3 + [0.015] * 3)
+MAX_OFFSET_DRIFT_RESIDUAL = np.array([0.3] * 3 + [0.015] * 3)
 """Largest residual that offsets follow, three times `change.OFFSET_DRIFT_STD` [N, N m]."""
 MIN_FORCE_CHANGE_N = 0.5
 """Smallest change of the low-passed force that noise cannot cause [N]."""
@@ -55,7 +55,7 @@ def initial_monitor_memory(theta: Array, covariance: Array) -> Array:
 @njit(cache=True)
 def _update_rest_detector(memory, sample, period):
     share = period / (_LOW_PASS_TIME_CONSTANT_S + period)
-    s, omega = sample[regressor.SAMPLE_SPECIFIC_FORCE], sample[regressor.SAMPLE_ANGULAR_VELOCITY]
+    s, omega = sample[regressor.SPECIFIC_FORCE_SLICE], sample[regressor.ANGULAR_VELOCITY_SLICE]
     shift, rate = 0.0, 0.0
     for i in range(3):
         memory[_SPECIFIC_FORCE_START + i] += share * (s[i] - memory[_SPECIFIC_FORCE_START + i])
@@ -70,14 +70,14 @@ def _update_rest_detector(memory, sample, period):
 
 
 @njit(cache=True)
-def _update_force_change_detector(memory, residual, age, period):
+def _update_force_change_detector(memory, residual, age_samples, period):
     low_passed = memory[_RESIDUAL_START : _RESIDUAL_START + 3]
     lowest = memory[_LOWEST_FORCE_START:_HIGHEST_FORCE_START]
     highest = memory[_HIGHEST_FORCE_START:_CHANGED_SAMPLES_INDEX]
-    share = 1.0 if age == 0.0 else period / (_LOW_PASS_TIME_CONSTANT_S + period)
+    share = 1.0 if age_samples == 0.0 else period / (_LOW_PASS_TIME_CONSTANT_S + period)
     for i in range(_RESIDUAL_START, _RESIDUAL_START + 6):
         memory[i] += share * (residual[i - _RESIDUAL_START] - memory[i])
-    if age * period < 2.0 * _LOW_PASS_TIME_CONSTANT_S:
+    if age_samples * period < 2.0 * _LOW_PASS_TIME_CONSTANT_S:
         copy_into(lowest, 0, low_passed, 0, 3)
         copy_into(highest, 0, low_passed, 0, 3)
     copy_into(lowest, 0, np.minimum(lowest, low_passed), 0, 3)
@@ -95,24 +95,24 @@ def _is_com_of_load_change_near_sensor(known, new):
 
 @njit(cache=True)
 def monitor_load(out, memory, sample, fallback, period, block, noise, window, hold, mass_std_ratio):
-    """Process one sample (15,): ramp `out` (16,), [offsets; phi], to the load to remove.
+    """Process one sample (15,): fade `out` (16,), [offsets; phi], to the load to remove.
 
-    `fallback` (10,) is the phi for a changed load; `block` and later: `change_detector_parameters`.
+    `fallback` (10,): phi for a changed load; `block` ... : results of `change_detector_parameters`.
     """
     watch = memory[_CHANGE_DETECTOR_START:]
     change.update_change_detector(watch, sample, block, noise, window, hold, mass_std_ratio)
     known, residual, target = watch[change.KNOWN_LOAD_SLICE], np.empty(6), np.empty(16)
-    wrench, motion = sample[regressor.SAMPLE_WRENCH], sample[regressor.SAMPLE_MOTION]
+    wrench, motion = sample[regressor.WRENCH_SLICE], sample[regressor.MOTION_SLICE]
     regressor.non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], known[6:], residual)
     for i in range(6):
         residual[i] = wrench[i] - known[i] - residual[i]
     at_rest = _update_rest_detector(memory, sample, period)
-    verdict, age = change.current_change_state(watch), change.new_load_age_in_samples(watch)
+    verdict, age = change.current_state_index(watch), change.new_load_age_in_samples(watch)
     force_changed = _update_force_change_detector(memory, residual, age, period)
     if verdict == change.STATE_KNOWN:
         memory[STATE_INDEX] = STATE_SETTLED
         low_passed = np.abs(memory[_RESIDUAL_START : _RESIDUAL_START + 6])
-        if at_rest and (low_passed <= MAX_RESIDUAL_OF_OFFSET_DRIFT).all():
+        if at_rest and (low_passed <= MAX_OFFSET_DRIFT_RESIDUAL).all():
             for i in range(6):
                 known[i] += period / OFFSET_TIME_CONSTANT_S * residual[i]
     elif memory[STATE_INDEX] != STATE_OTHER_LOAD:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import axis_names_of_rows
-from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
+from drake_teleop.load.batch.uncertainty import WRENCH_CHANNEL_NAMES
 from drake_teleop.load.identification import is_precise_enough
 from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.logs.causes import candidates
@@ -210,7 +210,7 @@ def _torque_factor_cause(fit: FittedModel) -> Finding:
 
 def _gain_error_cause(fit: FittedModel, channel_index: int) -> Finding:
     value, covariance = fit.parameters_of_extension(f"gain {channel_index}")
-    channel, wide = CHANNEL_NAMES[channel_index], 1.96 * float(np.sqrt(covariance[0, 0]))
+    channel, wide = WRENCH_CHANNEL_NAMES[channel_index], 1.96 * float(np.sqrt(covariance[0, 0]))
     text = (
         f"{channel} reads {100 * value[0]:.2f} % (+- {100 * wide:.2g}) more than expected from the"
         " other channels; calibrate the sensor"

@@ -6,7 +6,7 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import rotation_matrices
-from drake_teleop.load.batch.uncertainty import CHANNEL_NAMES
+from drake_teleop.load.batch.uncertainty import WRENCH_CHANNEL_NAMES
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.causes.cause import Finding
 from drake_teleop.logs.pose_motion.splines import PoseSplines
@@ -21,7 +21,7 @@ def wrench_channel_finding(log: Log, splines: PoseSplines | None, delay_s: float
     The delay of the log is removed; `splines` of its poses lag the wrench by `delay_s` [s].
     """
     few = log.select_rows(slice(None, None, 1 + len(log) // _MAX_COMPARED_SAMPLES))
-    R_WS, names = few.R_WS, [*CHANNEL_NAMES]
+    R_WS, names = few.R_WS, [*WRENCH_CHANNEL_NAMES]
     corrected = [*(few.wrench * (1.0 - 2.0 * np.eye(6)[:, None]))]
     if splines is not None:
         q = splines.quaternion(few.t + delay_s)
@@ -45,7 +45,7 @@ def wrench_channel_finding(log: Log, splines: PoseSplines | None, delay_s: float
     if not (found[name][0] < limit and found[name][1] > 0.0):
         return None
     kind, text = "mixed axes", f"only the {name} is in base axes; record force and torque in S"
-    if name in CHANNEL_NAMES:
+    if name in WRENCH_CHANNEL_NAMES:
         field = f"wrench.{'force' if name.startswith('f') else 'torque'}.scale"
         kind, text = "channel sign", f"{name} has the opposite sign; change its sign in {field}"
     return Finding(kind, f"payload not identifiable: {text}", values={"part": name})

@@ -121,6 +121,6 @@ class ContactDetector(DoubleOnlySystem, contact_detection.ContactDetection):
         self, context: Context, memory: Array, sample: Array, estimate: Array
     ) -> bool:
         gravity = self._orientation.Eval(context).reshape(3, 3).T @ self._gravity_W
-        acceleration = sample[regressor.SAMPLE_SPECIFIC_FORCE] + gravity
+        acceleration = sample[regressor.SPECIFIC_FORCE_SLICE] + gravity
         update = contact_detection.update_contact_flag_with_sample
         return bool(update(memory, sample, estimate, acceleration, self._settings))

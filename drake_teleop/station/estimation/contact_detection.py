@@ -33,8 +33,8 @@ class ContactDetectionConfig:
 
 
 @njit(cache=True)
-def _detect_with_joint_angles(memory, sample, estimate, arm, settings):
-    s, acceleration = sample[regressor.SAMPLE_SPECIFIC_FORCE], np.empty(3)
+def _detect_contact_using_arm(memory, sample, estimate, arm, settings):
+    s, acceleration = sample[regressor.SPECIFIC_FORCE_SLICE], np.empty(3)
     q = sample[regressor.FIRST_JOINT_INDEX : regressor.SAMPLE_TIME_INDEX]
     acceleration_from_specific_force_into(arm, q, s, acceleration)
     return update_contact_flag_with_sample(memory, sample, estimate, acceleration, settings)
@@ -50,9 +50,9 @@ def update_contact_flag_with_sample(memory, sample, estimate, acceleration, sett
     if not (valid and are_valid_port_values(acceleration)):
         return memory[CONTACT_INDEX] != 0.0
     contact = np.empty(6)
-    s, omega = sample[regressor.SAMPLE_SPECIFIC_FORCE], sample[regressor.SAMPLE_ANGULAR_VELOCITY]
-    alpha = sample[regressor.SAMPLE_ANGULAR_ACCELERATION]
-    wrench, offset, phi = sample[regressor.SAMPLE_WRENCH], estimate[:6], estimate[6:]
+    s, omega = sample[regressor.SPECIFIC_FORCE_SLICE], sample[regressor.ANGULAR_VELOCITY_SLICE]
+    alpha = sample[regressor.ANGULAR_ACCELERATION_SLICE]
+    wrench, offset, phi = sample[regressor.WRENCH_SLICE], estimate[:6], estimate[6:]
     scaled_wrench_into(wrench, offset, s, omega, alpha, phi, np.zeros(10), 0.0, 0.0, 1.0, contact)
     return update_contact_flag(memory, contact, s, omega, alpha, acceleration, *settings)
 
@@ -93,7 +93,7 @@ class ContactDetection(LeafSystem):
     def _update_and_get_contact_flag(
         self, context: Context, memory: Array, sample: Array, estimate: Array
     ) -> bool:
-        return bool(_detect_with_joint_angles(memory, sample, estimate, self._arm, self._settings))
+        return bool(_detect_contact_using_arm(memory, sample, estimate, self._arm, self._settings))
 
     def _update_contact_flag_state(self, context: Context, discrete_state: DiscreteValues) -> None:
         sample = self._sample.Eval(context)

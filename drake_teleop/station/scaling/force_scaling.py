@@ -116,9 +116,9 @@ def blend_scales_at(ramp, time, scales):
 
 @njit(cache=True)
 def _scaled_wrench_into(sample, estimate, gripper, arm, scales, out):
-    wrench, s = sample[regressor.SAMPLE_WRENCH], sample[regressor.SAMPLE_SPECIFIC_FORCE]
-    omega = sample[regressor.SAMPLE_ANGULAR_VELOCITY]
-    alpha = sample[regressor.SAMPLE_ANGULAR_ACCELERATION]
+    wrench, s = sample[regressor.WRENCH_SLICE], sample[regressor.SPECIFIC_FORCE_SLICE]
+    omega = sample[regressor.ANGULAR_VELOCITY_SLICE]
+    alpha = sample[regressor.ANGULAR_ACCELERATION_SLICE]
     phi_gripper, phi_object = gripper[6:], np.empty(10)
     for i in range(10):
         phi_object[i] = estimate[6 + i] - phi_gripper[i]
@@ -141,8 +141,8 @@ def find_sample_fault(sample, estimate, time, sample_limits):
     """
     if not abs(time - sample[regressor.SAMPLE_TIME_INDEX]) <= sample_limits[6]:
         return _STALE_SAMPLE_FAULT
-    reading = sample[regressor.SATURATION_FLAG_INDEX] < regressor.MIN_LOST_SAMPLE_FLAG_VALUE
-    reading = reading and are_valid_port_values(sample[regressor.SAMPLE_MOTION])
+    reading = sample[regressor.SATURATION_FLAG_INDEX] < regressor.LOST_SAMPLE_FLAG_THRESHOLD
+    reading = reading and are_valid_port_values(sample[regressor.MOTION_SLICE])
     for i in range(6):
         reading = reading and abs(sample[i]) <= sample_limits[i]
     if not reading:
@@ -166,7 +166,7 @@ def _unscaled_contact_wrench_into(sample, estimate, gripper, _ramp, _time, arm, 
 
 @njit(cache=True)
 def _non_contact_wrench_into(sample, estimate, _gripper, _ramp, _time, out):
-    motion = sample[regressor.SAMPLE_MOTION]
+    motion = sample[regressor.MOTION_SLICE]
     regressor.non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], estimate[6:], out)
 
 

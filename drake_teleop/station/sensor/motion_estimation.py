@@ -235,7 +235,7 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
     """
     constants, n = constants[0], sample.shape[0] - regressor.FIRST_JOINT_INDEX
     motion = memory[_SCRATCH_START_INDEX:_JOINTS_START_INDEX]
-    angles, gravity = sample[regressor.SAMPLE_JOINT_POSITIONS], motion[:3]
+    angles, gravity = sample[regressor.JOINT_POSITIONS_SLICE], motion[:3]
     _equalize_signal_delays(constants, memory, n, reading, sample)
     if arm.shape[0] == 0:
         copy_into(motion, 3, angles, 0, 3)
@@ -245,7 +245,7 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
         serial_arm.sensor_motion(arm, angles, joints[:n], joints[n:], motion)
         gravity = arm[n, serial_arm.LAST_ROW_GRAVITY_COLUMN :]
     if constants.encoders_only != 0.0:
-        copy_into(sample, regressor.SAMPLE_MOTION.start, motion, 0, 9)
+        copy_into(sample, regressor.MOTION_SLICE.start, motion, 0, 9)
     else:
         _convert_and_fuse_accelerometer(constants, memory, gravity, motion, sample)
     memory[0] += 1.0
@@ -261,7 +261,7 @@ def measure_sample_into(sensor, arm, noise, truth, chain_memory, estimator_memor
     chain, estimator, ideal = sensor
     flag = regressor.SATURATION_FLAG_INDEX
     if not are_values_plausible(chain, truth):  # keeps it out of the filters
-        sample[flag] = regressor.MIN_LOST_SAMPLE_FLAG_VALUE + NUM_FLAGGED_SAMPLES_AFTER_LOSS
+        sample[flag] = regressor.LOST_SAMPLE_FLAG_THRESHOLD + NUM_FLAGGED_SAMPLES_AFTER_LOSS
         return
     lost = sample[flag] - 1.0
     if ideal:
@@ -272,13 +272,13 @@ def measure_sample_into(sensor, arm, noise, truth, chain_memory, estimator_memor
         reading = np.empty(truth.shape[0] - 2)
         read_sensor_into(chain, chain_memory, noise, truth, reading)
         estimate_sample_into(estimator, estimator_memory, arm, reading, sample)
-    if lost >= regressor.MIN_LOST_SAMPLE_FLAG_VALUE:
+    if lost >= regressor.LOST_SAMPLE_FLAG_THRESHOLD:
         sample[flag] = lost
 
 
 @njit(cache=True)
 def _equalize_signal_delays(constants, memory, num_joints, reading, sample):
-    sections, angles = constants.angle_low_passes[:], sample[regressor.SAMPLE_JOINT_POSITIONS]
+    sections, angles = constants.angle_low_passes[:], sample[regressor.JOINT_POSITIONS_SLICE]
     filtered = memory[_JOINTS_START_INDEX:][: _MEMORY_SIZE_PER_JOINT * num_joints][5 * num_joints :]
     copy_into(angles, 0, reading, READ_ANGLES.start, num_joints)
     if memory[0] == 0.0:
@@ -292,8 +292,8 @@ def _equalize_signal_delays(constants, memory, num_joints, reading, sample):
     if memory[0] == 0.0:
         line[1:] = line[0]
     waits = constants.wait_samples
-    copy_into(sample, regressor.SAMPLE_WRENCH.start, line[int(waits[0])], 0, 6)
-    copy_into(sample, regressor.SAMPLE_MOTION.start, line[int(waits[1])], 6, 6)
+    copy_into(sample, regressor.WRENCH_SLICE.start, line[int(waits[0])], 0, 6)
+    copy_into(sample, regressor.MOTION_SLICE.start, line[int(waits[1])], 6, 6)
     wait, older = int(waits[2]), waits[2] - int(waits[2])
     now, before = line[wait], line[min(wait + 1, line.shape[0] - 1)]
     for i in range(num_joints):
@@ -321,8 +321,8 @@ def _differentiate_joint_angles(constants, is_first, memory, angles):
 @njit(cache=True)
 def _convert_and_fuse_accelerometer(constants, memory, gravity, motion, sample):
     period, fused, starts = constants.period, constants.fused != 0.0, memory[0] == 0.0
-    s, omega = sample[regressor.SAMPLE_SPECIFIC_FORCE], sample[regressor.SAMPLE_ANGULAR_VELOCITY]
-    alpha = sample[regressor.SAMPLE_ANGULAR_ACCELERATION]
+    s, omega = sample[regressor.SPECIFIC_FORCE_SLICE], sample[regressor.ANGULAR_VELOCITY_SLICE]
+    alpha = sample[regressor.ANGULAR_ACCELERATION_SLICE]
     R_SA, R = matrix_as_tuple(constants.R_SA), motion[12:21]
     alpha[0], alpha[1], alpha[2] = apply_matrix(R_SA, vector_at(omega, 0))
     s[0], s[1], s[2] = apply_matrix(R_SA, vector_at(s, 0))

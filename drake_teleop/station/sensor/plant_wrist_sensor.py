@@ -160,7 +160,7 @@ class PlantWristSensor(DoubleOnlySystem, LeafSystem):
         self._no_noise, self._no_arm = np.zeros(NOISE_BLOCK_SIZE), np.zeros((0, 1))
         # The sample, with the angular velocity as three more joints, and its time.
         sample = np.zeros(regressor.sample_size(3 + n) + 1)
-        sample[regressor.SATURATION_FLAG_INDEX] = regressor.MIN_LOST_SAMPLE_FLAG_VALUE
+        sample[regressor.SATURATION_FLAG_INDEX] = regressor.LOST_SAMPLE_FLAG_THRESHOLD
 
         self._state = self.DeclareVectorInputPort("state", plant.num_multibody_states(*which))
         self._poses, self._velocities, self._accelerations, self._reactions = (

@@ -33,10 +33,10 @@ from drake_teleop.common.vectors import (
     vector_at,
 )
 from drake_teleop.load.regressor import (
-    SAMPLE_ANGULAR_ACCELERATION,
-    SAMPLE_ANGULAR_VELOCITY,
-    SAMPLE_SPECIFIC_FORCE,
-    SAMPLE_WRENCH,
+    ANGULAR_ACCELERATION_SLICE,
+    ANGULAR_VELOCITY_SLICE,
+    SPECIFIC_FORCE_SLICE,
+    WRENCH_SLICE,
 )
 
 #: Samples per block of random numbers: one event of a noise source, one step of a walk.
@@ -394,8 +394,8 @@ def shift_delay_line(line):
 
 @njit(cache=True)
 def _apply_calibration_errors(constants, truth, out):
-    wrench, s = truth[SAMPLE_WRENCH], truth[SAMPLE_SPECIFIC_FORCE]
-    omega, alpha = truth[SAMPLE_ANGULAR_VELOCITY], truth[SAMPLE_ANGULAR_ACCELERATION]
+    wrench, s = truth[WRENCH_SLICE], truth[SPECIFIC_FORCE_SLICE]
+    omega, alpha = truth[ANGULAR_VELOCITY_SLICE], truth[ANGULAR_ACCELERATION_SLICE]
     for i in range(6):
         value = 0.0
         for j in range(6):

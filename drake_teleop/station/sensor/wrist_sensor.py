@@ -76,8 +76,8 @@ def true_sample_into(arm, phi, q, v, vdot, contact_W, out):
     """
     motion = np.empty(serial_arm.SENSOR_MOTION_SIZE)
     serial_arm.sensor_motion(arm, q, v, vdot, motion)
-    copy_into(out, regressor.SAMPLE_MOTION.start, motion, 0, 9)
-    wrench = out[regressor.SAMPLE_WRENCH]
+    copy_into(out, regressor.MOTION_SLICE.start, motion, 0, 9)
+    wrench = out[regressor.WRENCH_SLICE]
     regressor.non_contact_wrench_into(motion[:3], motion[3:6], motion[6:9], phi, wrench)
     # The contact wrench is about the world's origin; about So its moment is tau - p_WS x f.
     f, p_WS, R_SW = vector_at(contact_W, 0), vector_at(motion, 9), transposed(matrix_at(motion, 12))
@@ -279,7 +279,7 @@ class WristSensor(LeafSystem):
         self.contact_pairs = self._physics[2]
         first = sample_at_rest(arm, slave.start)
         if not config.ideal:
-            first[regressor.SAMPLE_WRENCH] += config.offset
+            first[regressor.WRENCH_SLICE] += config.offset
         #: Reason why contact is outside the compiled contact law, or "".
         self.reason_beyond_contact_law = contact.drake_contact_reason
         # The plant's contact wrench costs as much as two samples; noise exceeds its gain by 1e9.
@@ -465,7 +465,7 @@ def sample_at_rest(arm: serial_arm.ArmModel, q: Array) -> Array:
     """Return the true sample (16 + n,) with the arm at rest at the joint angles q (n,) [rad]."""
     sample, still = np.zeros(regressor.sample_size(len(q))), np.zeros(len(q))
     true_sample_into(arm.table, arm.phi_load, q, still, still, np.zeros(6), sample)
-    sample[regressor.SAMPLE_JOINT_POSITIONS] = q
+    sample[regressor.JOINT_POSITIONS_SLICE] = q
     return sample
 
 
