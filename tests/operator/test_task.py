@@ -383,7 +383,7 @@ def test_training_contains_scales_and_delays_of_the_station(monkeypatch):
         force_scaling__force_scale=0.1,
         simulation__seed=7,
     )
-    _, _, training, _, tip = master_side._make_scenario_operator(scenario, np.eye(7)[0])
+    _, _, training, _, tip = master_side._make_operator(scenario, np.eye(7)[0])
     assert (training.translation_scale, training.force_gain, training.seed) == (2.0, 0.05, 7)
     assert (training.forward_delay_s, training.backward_delay_s) == (0.02, 0.05)
     R_WB = RollPitchYaw(0.1, -0.2, 0.3).ToRotationMatrix().matrix()
