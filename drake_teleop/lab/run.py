@@ -157,7 +157,7 @@ def run_scenario(
     """Run a scenario; the load is estimated during the run, or else cached or identified before.
 
     Without operator motion and task, a run that estimates the load excites it by a trajectory.
-    `log` is as in `simulate`; `fresh` ignores the cached load.
+    `progress`: True, or a `StartStage`; `log`: as in `simulate`; `fresh`: ignore the cached load.
     """
     check_scenario(scenario)
     estimates_load, source = scenario.load_estimator.enabled, "estimated during the run"

@@ -380,7 +380,7 @@ def test_arm_that_rotates_its_sensor_about_one_axis_is_an_error(tmp_path, capsys
         main(["excite", "--model", str(path), "--sensor-frame", "l4", "--out", str(tmp_path)])
     assert stop.value.code == 2
     message = " ".join(capsys.readouterr().err.split())
-    assert "rotate the sensor about fewer than two axes" in message
+    assert "rotate the sensor about at most one axis" in message
     assert "load_estimate" in message and "--time" not in message
 
 

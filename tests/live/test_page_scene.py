@@ -73,7 +73,7 @@ def test_failed_scene_is_reported_without_an_error(scenario, rows, monkeypatch, 
         "view": "own", "no_view": "no 3D scene: no port is free for this", "moves": {},
     }  # fmt: skip
     said = capsys.readouterr().err
-    assert said == f"warning: {view.failure}; the drive continues without it\n"
+    assert said == f"warning: {view.failure}; the session continues without 3D\n"
 
 
 def test_scene_that_fails_later_is_reported_once(scenario, rows, capsys):

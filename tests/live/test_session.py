@@ -370,7 +370,7 @@ def test_inputs_are_clipped_and_invalid_ones_ignored():
             "recorded with drake_teleop 1.1, not with 1.2; it cannot",
         ),
         (HEADER.replace(", drake 3.4", ""), "recorded with drake unknown, not with 3.4"),
-        (HEADER.partition("\n")[2] + "0,0\n", "contain the version of drake_teleop that wrote it"),
+        (HEADER.partition("\n")[2] + "0,0\n", "lacks the version of drake_teleop that wrote it"),
         ("# \n" + HEADER.partition("\n")[2], "recorded with drake_teleop unknown"),
     ],
 )

@@ -231,7 +231,7 @@ def test_undetermined_auto_raises_error(folder, tmp_path):
     ("pose", "wrench", "message"),
     [
         ({"frame": TURN.tolist(), "rotation_in_sensor": TURN.tolist()}, {}, "give one of them"),
-        ({"position": None, "position_in_sensor": "auto"}, {}, "require positions"),
+        ({"position": None, "position_in_sensor": "auto"}, {}, "require pose.position"),
         ({"rotation_in_sensor": "auto"}, {"frame": "base"}, "axes of the sensor, not in base"),
         ({"rotation_in_sensor": "base"}, {}, "must be a 3x3 rotation matrix"),
         ({"rotation_in_sensor": "tool"}, {}, "from the stream to S, or the word auto"),

@@ -187,7 +187,7 @@ def test_kind_of_a_change_needs_rotations_after_it(
     for other, expected in ((-25.0, certain), (-15.0, False)):
         state = SimpleNamespace(
             model=LoadModel(steps=(StepChange("load", 5.0),)),
-            data=SimpleNamespace(t=t, y=y, used=np.ones(len(t), bool)),
+            means=SimpleNamespace(t=t, y=y, used=np.ones(len(t), bool)),
             x=np.zeros(27),
             log_likelihood=0.0,
             refit=lambda model, start, other=other: SimpleNamespace(log_likelihood=other),

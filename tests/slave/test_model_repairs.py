@@ -321,7 +321,7 @@ def test_hold_is_read_from_a_scenario_and_written_to_one(tmp_path):
     write_scenario(tmp_path / "b.yaml", scenario)
     assert LoadScenario(tmp_path / "b.yaml").slave.hold == {"j4": -0.2}
     for wrong, expected in (
-        ("[j4]", "slave.hold: expected a mapping"),
+        ("[j4]", "slave.hold: expected names with values"),
         ("{j4: x}", "hold.j4: exp"),
     ):
         with pytest.raises(DrakeTeleopError, match=expected):

@@ -74,7 +74,9 @@ def _parse_gravity(value: Any) -> Any:
     if isinstance(value, str) and value != "auto":
         raise ValueError("gravity must be a number, three numbers [m/s^2], or the word auto")
     if _is_number(value) and value < 0.0:
-        raise ValueError(f"gravity is {value:g}, but has no sign: remove it, or give a vector")
+        raise ValueError(
+            f"the magnitude of gravity is {value:g}: remove the sign, or give a vector"
+        )
     return [0.0, 0.0, -float(value)] if _is_number(value) else value
 
 
