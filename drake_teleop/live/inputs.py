@@ -167,8 +167,8 @@ INPUT_RANGES = {entry.name: entry.metadata["range"] for entry in dataclasses.fie
 STATION_SWAP_INPUTS = frozenset(list(INPUT_RANGES)[list(INPUT_RANGES).index("network") :])
 _CSV_COLUMNS = ("ms", *INPUT_RANGES)
 # The scales of a scenario, up to 100, may exceed the ranges of the page.
-_MAX_RECORDED_SCALES = dict.fromkeys(("sigma", "sigma_weight", "sigma_object", "gamma"), 10_000)
-_MAX_RECORDED_SCALES["force_scale"] = 10_000_000
+_MAX_SCALES_IN_RECORDING = dict.fromkeys(("sigma", "sigma_weight", "sigma_object", "gamma"), 10_000)
+_MAX_SCALES_IN_RECORDING["force_scale"] = 10_000_000
 
 
 def input_range(name: str) -> tuple[int, int]:
@@ -258,7 +258,7 @@ def _parse_csv_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, I
         earlier, inputs = ms, dict(zip(INPUT_RANGES, values, strict=True))
         for name in INPUT_RANGES:
             low, high = input_range(name)
-            high = _MAX_RECORDED_SCALES.get(name, high)
+            high = _MAX_SCALES_IN_RECORDING.get(name, high)
             if not low <= inputs[name] <= high:
                 raise _csv_row_error(f"{name} = {inputs[name]} is outside {low} to {high}", where)
         yield ms, Inputs(**inputs)

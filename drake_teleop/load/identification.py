@@ -147,7 +147,7 @@ class Identification:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write identification.json; raise DrakeTeleopError if a number is not finite."""
+        """Write identification.json; refuse a non-finite delay, residual or condition number."""
         for name, shape in (("condition_number", ()), ("delay_s", ()), ("residual_rms", (6,))):
             finite_array(f"{path}:{name}", getattr(self, name), *shape)
         fields = list(self.__dataclass_fields__)
@@ -210,7 +210,7 @@ def mark_undetermined(covariance: Array, is_undetermined: NDArray[np.bool_]) -> 
 
 
 def natural_scales(phi: Array) -> Array:
-    """Return typical magnitudes (16,) of [offsets; phi] for a load of this mass and centre."""
+    """Return typical magnitudes (16,) of [offsets; phi] of a load with this mass and com."""
     m = abs(phi[0])
     L = max(float(np.linalg.norm(phi[1:4])) / m, _MIN_LOAD_SIZE_M)
     scale: Array = m * np.repeat([_G_M_S2, _G_M_S2 * L, 1.0, L, L * L / 3.0], [3, 3, 1, 3, 6])

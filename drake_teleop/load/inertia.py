@@ -64,7 +64,7 @@ def phi_from_pseudo_inertia(J: ArrayLike) -> Array:
     J = finite_array("J", J, 4, 4)
     if np.abs(J - J.T).max() > 1e-9 * np.abs(J).max():
         what = "the pseudo-inertia is not symmetric"
-        raise DrakeTeleopError(what, where="J", remedy="give the symmetric part")
+        raise DrakeTeleopError(what, where="J", remedy="give (J + J.T) / 2")
     Sigma = J[:3, :3]
     I = np.trace(Sigma) * np.eye(3) - Sigma  # noqa: E741
     return np.concatenate([[J[3, 3]], J[:3, 3], I[np.triu_indices(3)]])

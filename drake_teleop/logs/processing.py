@@ -111,7 +111,7 @@ class EliminatedLog:
         non_contact: load's wrench V phi.
         contact: contact wrench F_c, Eq. (13).
         scaled: scaled wrench gamma F_c + sigma V phi.
-        gravity_only: wrench without weight, tared after its removal; None without orientation.
+        gravity_only: wrench without weight, with offsets chosen as for `contact`; or None.
         noise_floor: (6,) noise of `contact` [N, N m].
         causal: wrenches as in a control loop, if requested.
         edge: (N,) True for samples near ends and gaps, excluded from all figures.

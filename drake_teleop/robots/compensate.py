@@ -60,7 +60,7 @@ def compensate_stream(
     changes: ZeroAndLoadMonitor | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> Counter[str]:
-    """Compensate readings until the end or Ctrl-C, `tare` True: tare first; return flag counts."""
+    """Compensate readings until the end or Ctrl-C; return counts of wrenches and flags."""
     counts: Counter[str] = Counter(wrenches=0)
     tare_count = np.inf if not tare else round(TARE_AVERAGING_S / source.dt)
 

@@ -78,7 +78,7 @@ def flag_pose_oscillation(
 ) -> Flags:
     """Return (N,) flags: True while the actual pose (N, 7) oscillates and the command does not.
 
-    Reversals exceed 0.5 mm or 0.5 degrees, and are `window` [s] from those of the command.
+    Reversals exceed 0.5 mm or 0.5 degrees and are over `window` [s] from those of the command.
     """
     turned, wanted = (doubled_quaternions(pose, command) for pose in (actual, command))
     swaying = flag_unexplained_oscillation(t, command[:, 4:], actual[:, 4:], _MIN_SWING_M, window)

@@ -47,8 +47,8 @@ _CAMERA_SHIFT_WITHOUT_DEVICE_W_M = np.array([-0.3, 0.0, 0.0])  # of camera and t
 _FLOOR_COLOUR = Rgba(0.93, 0.94, 0.95)
 _WOOD_COLOUR = Rgba(0.78, 0.66, 0.50)
 _STEEL_COLOUR = Rgba(0.40, 0.43, 0.47)
-_HAND_GRIP_POSITION_M = np.array([0.09, 0.0, 0.0])  # where the hand holds the stylus
-_SLAVE_WRIST_POSITION_M = np.array([0.0, 0.0, -0.085])  # wrist of the arm
+_HAND_GRIP_POSITION_M = np.array([0.09, 0.0, 0.0])  # in E, where the hand holds the stylus
+_SLAVE_WRIST_POSITION_M = np.array([0.0, 0.0, -0.085])  # in S, wrist of the arm
 # Arrows inside arm and tool would be hidden.
 _WRIST_ARROW_OFFSET_W_M = np.array([0.07, -0.09, 0.0])
 _TIP_ARROW_OFFSET_W_M = np.array([-0.06, 0.0, 0.0])

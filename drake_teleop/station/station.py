@@ -37,8 +37,8 @@ def MakeTeleopStation(
 
     Args:
         load_estimate: (16,) Eq. (7), [offsets [N, N m]; phi] about So in S, from an identification.
-            Optional if the estimator runs online or load and contact have equal scales; signal
-            `contact_wrench_S` requires it.
+            Optional if the estimator runs online, or if load and contact have equal scales; then
+            there is no signal `contact_wrench_S` without an estimate.
         load_covariance: (16, 16) covariance of the estimate, for a monitored load
             (`load_estimator.watch`). Use a method for noisy motion ("total"); the covariance of
             least squares is too small.

@@ -206,7 +206,7 @@ def identify_batch(
         offsets: False if the wrench contains no offsets.
         shared_noise: True for poses at rest: one noise level for forces, one for torques.
         resolution: (2,) quantisation step of forces and torques [N, N m], for `shared_noise` only.
-        gain_std: relative standard deviation of the sensor's 36 gains.
+        delay_s, gain_std: removed delay of the motion [s]; relative std of the sensor's 36 gains.
     """
     METHODS.check(method, "method")
     expect_type((NoiseStd, type(None)), noise, "noise")

@@ -177,7 +177,7 @@ class FittedModel:
 
     @cached_property
     def smooth_misfit(self) -> float:
-        """Likelihood gain of smooth signals per added parameter; about 1 or less for noise."""
+        """Gain in 2 log likelihood by smooth signals, per added parameter; about 1 for noise."""
         gain, freedom = self.smooth_likelihood_gain
         return gain / max(1, freedom - self.model.size)
 

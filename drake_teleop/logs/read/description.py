@@ -103,7 +103,7 @@ class _StreamDescription(StrictModel):
 
     @property
     def source(self) -> Path:
-        """Path that identifies the table: the file, in a bag with the topic."""
+        """Path that identifies the table: the file, in a bag with topic and child frame."""
         return self.file
 
     @property

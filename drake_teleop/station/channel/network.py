@@ -48,7 +48,7 @@ class NetworkConfig:
     burst_loss: float = quantity(1.0, "1", 0.01, 1.0, "share of packets that a loss burst loses")
     duplicate: float = quantity(0.0, "1", 0.0, 1.0, "share of duplicated packets")
     rate_hz: float | None = quantity(None, "Hz", 1.0, 1e5, "largest packet rate; null: every step")
-    playout: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "jitter buffer: age of packets at use")
+    playout: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "jitter buffer: least age of packets")
     redundant: bool = plain(False, "each packet repeats the data of the last `playout` seconds")
     trace: str | None = plain(
         None,
@@ -68,9 +68,9 @@ class NetworkConfig:
     def check(self, where: str = "network") -> None:
         check_all_field_values(self, where)
         if self.loss > self.burst_loss:
-            what = f"mean loss {self.loss:g} is above burst_loss {self.burst_loss:g} of the bad"
+            what = f"mean loss {self.loss:g} is above burst_loss {self.burst_loss:g}"
             place, remedy = field_location(where, "loss"), "raise burst_loss to at least the mean"
-            raise DrakeTeleopError(f"{what} state", where=place, remedy=f"{remedy} loss")
+            raise DrakeTeleopError(what, where=place, remedy=f"{remedy} loss")
 
 
 _presets = {

@@ -117,7 +117,7 @@ class Block(Surface):
     size: list[float] = quantity([0.1, 0.1, 0.1], "m", 0.01, 1.0, "lengths of its edges")
     mass: float = quantity(0.5, "kg", 0.01, 100.0, "mass of the block, evenly distributed")
     table: list[float] = quantity(
-        [0.5, 0.5], "m", 0.0, 4.0, "edges x, y of a table with the block's surface; 0: no table"
+        [0.5, 0.5], "m", 0.0, 4.0, "edges x, y of a table with the block's contact law; 0: none"
     )
 
     def check(self, where: str) -> None:

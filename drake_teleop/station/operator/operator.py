@@ -55,7 +55,7 @@ GRIP_IMPEDANCES = {
 @settings
 @dataclass
 class MinimumJerk:
-    """Minimum-jerk move: 10 u^3 - 15 u^4 + 6 u^5 is complete at u = (t - t_start) / duration."""
+    """Minimum-jerk move: share 10 u^3 - 15 u^4 + 6 u^5 done at u = (t - t_start) / duration."""
 
     t_start: float = quantity(0.0, "s", 0.0, 1e6, "start of the move")
     duration: float = quantity(1.0, "s", 1e-3, 1e6, "duration of the move")

@@ -33,7 +33,7 @@ class Reach(_Task):
 
 @dataclass
 class _ContactTask(_Task):
-    standoff: float = quantity(0.015, "m", 0.0, 0.5, "careful approach within this target distance")
+    standoff: float = quantity(0.015, "m", 0.0, 0.5, "distance to the target of careful approach")
 
 
 @settings

@@ -80,7 +80,7 @@ class WristSensorConfig:
     ideal: bool = plain(False, "no sensor errors: true values in sensor frame S, without delay")
 
     gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest gain error of force and torque")
-    cross_talk: float = quantity(0.0, "1", 0.0, 0.1, "cross-talk at another channel's full range")
+    cross_talk: float = quantity(0.0, "1", 0.0, 0.1, "largest cross-talk, share of full range")
     misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "rotation error of the wrench axes from S")
     acceleration_gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest acceleration gain error")
     acceleration_misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "rotation error of axes A")

@@ -43,7 +43,7 @@ def ArmModelFromPlant(
     """Return the arm between the world and the sensor frame of a finalized plant.
 
     A DrakeTeleopError is raised if a joint between them is not revolute, prismatic or a weld, or a
-    further joint moves a body on links. Joints beyond S are at their default positions.
+    further joint moves a body on these links. Joints beyond S are at their default positions.
     """
     if not plant.HasFrameNamed(sensor_frame_name, model_instance):
         what = f"{plant.GetModelInstanceName(model_instance)} has no frame {sensor_frame_name!r}"

@@ -34,13 +34,13 @@ class PositionInterface:
     """Settings of a robot controller for position commands; for prismatic joints rad means m."""
 
     command_hz: float = quantity(500.0, "Hz", 1.0, 1e4, "rate of the commands")
-    dead_time: float = quantity(0.004, "s", 0.0, 1.0, "command delay; multiple of 1 / command_hz")
+    dead_time: float = quantity(0.004, "s", 0.0, 1.0, "command delay, rounded to 1/command_hz")
     acceleration_per_error: float = quantity(300.0, "1/s^2", 1.0, 1e7, "acceleration per error")
     lookahead: float = quantity(0.1, "s", 1e-4, 2.0, "lag behind a command of constant speed")
     max_speed: float = quantity(
-        math.pi, "rad/s", 1e-3, 100.0, "joint speed limit, unless that of the model is lower"
+        math.pi, "rad/s", 1e-3, 100.0, "joint speed limit, unless the arm's own is lower"
     )
-    max_acceleration: float = quantity(40.0, "rad/s^2", 1e-2, 1e4, "limit of joint acceleration")
+    max_acceleration: float = quantity(40.0, "rad/s^2", 1e-2, 1e4, "limit unless the arm's is less")
     drive_bandwidth_hz: float = quantity(30.0, "Hz", 0.1, 1e3, "drives' bandwidth; sets stiffness")
 
     def check(self, where: str, rate: float) -> None:

@@ -213,7 +213,7 @@ class ParsedSlave(NamedTuple):
         arm_from_plant.check_arm_lengths(arm, str(self.slave.path))
         arm, assumed = arm_from_plant.fill_missing_joint_limits(arm, str(self.slave.path))
         if arm.num_joints < 6:
-            assumed.append(f"the tool follows part of the pose, as it has {arm.num_joints} joints")
+            assumed.append(f"with {arm.num_joints} joints the tool follows only part of the pose")
         return arm, assumed
 
 

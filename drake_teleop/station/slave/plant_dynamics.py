@@ -141,7 +141,7 @@ def add_force_to_wrench(wrench_W, p_WC, force_W):
 class ToolContact(LeafSystem):
     """Block that outputs the environment's wrench (6,) on the tool about the world's origin.
 
-    Ports sheet_state [z; v_z] and plant_state [q; v] exist with a leaf, with other moving bodies.
+    Ports sheet_state [z; v_z] and plant_state [q; v] exist with a leaf or other moving bodies.
     """
 
     __slots__ = NO_EXTRA_SLOTS

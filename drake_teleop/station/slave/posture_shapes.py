@@ -53,7 +53,7 @@ class PostureShapes:
         assumptions: texts about missing data of the models.
         tool_body, tool_bodies: indices of the body on the sensor, and of all bodies beyond it.
         surroundings: indices of the bodies of the environment.
-        has_sticks: whether they do.
+        has_sticks: whether sticks replace the shapes of the arm.
     """
 
     def __init__(
