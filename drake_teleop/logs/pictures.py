@@ -200,7 +200,7 @@ def draw_detection(found: DetectedLog) -> Any:
         top.axhline(found.force_threshold, color=BLACK, linewidth=0.8, linestyle=":")
         top.set_yscale("symlog", linthresh=1.0)
         top.set_ylim(bottom=0.0)
-        top.set(ylabel="$|F|$ [N]", title="dotted: 1.25 times the largest |F| in free motion")
+        top.set(ylabel="$|F|$ [N]", title="dotted: 1.25 x largest contact |F| in free motion")
         below.plot(t, found.statistics[inner, STATISTIC_NAMES.index(found.statistic)], color=BLUE)
         below.axhline(found.threshold, color=BLACK, linewidth=0.8, linestyle="--")
         below.set(xlabel="time [s]", ylabel=f"{found.statistic} [standard deviations]")

@@ -55,9 +55,9 @@ def correct_imu_data(splines: PoseSplines, imu: ImuData, gravity_W: Array) -> Im
     )
     own = tuple(found[index].noise_power if index in found else 0.0 for index in range(2))
     imu_rows = ImuSplineRows(t[inside], rows.rate, powers, (own[0], own[1]))
-    imu_rows = imu_rows.with_data_in_sensor_axes(splines, gravity_W, s, omega)
+    imu_rows = imu_rows.with_sensor_data_in_world_axes(splines, gravity_W, s, omega)
     both = PoseSplines(splines.poses, splines.spacing, imu_rows)
-    return imu_rows.with_data_in_sensor_axes(both, gravity_W, s, omega)
+    return imu_rows.with_sensor_data_in_world_axes(both, gravity_W, s, omega)
 
 
 def _fit_sensor_model(

@@ -48,7 +48,7 @@ class ImuSplineRows:
     acceleration_W: Array | None = None
     quaternion_rate: Array | None = None
 
-    def with_data_in_sensor_axes(
+    def with_sensor_data_in_world_axes(
         self, splines: PoseSplines, gravity_W: Array, s: Array | None, omega: Array | None
     ) -> ImuSplineRows:
         """Return rows in the world from specific force s and angular velocity (K, 3) in S."""

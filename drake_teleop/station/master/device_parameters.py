@@ -43,7 +43,7 @@ def pack_device_parameters(**values: ArrayLike) -> Records:
 
 @njit(cache=True)
 def end_stop_force(x, rate, lower, upper, stiffness, damping):
-    """Return the force of an end stop at x with speed `rate`; it only pushes towards the limits."""
+    """Return the force of an end stop at x with speed `rate`; it pushes only into the range."""
     if x > upper:
         return min(0.0, -stiffness * (x - upper) - damping * rate)
     if x < lower:

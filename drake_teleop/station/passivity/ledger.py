@@ -80,7 +80,7 @@ class LedgerConfig:
         "energy reserve of the slave; bounds its kinetic energy and so its speed",
     )  # fmt: skip
     hand_reserve: list[float] = quantity(
-        [0.02, 1e-3], "J", 1e-9, 1e3, "energy reserve of the master, to push the hand"
+        [0.02, 1e-3], "J", 1e-9, 1e3, "energy that the master keeps, to push the hand"
     )
     drag: list[float] = quantity(
         [0.28, 5e-3], "N, N m", 0.0, 10.0, "drag on the hand until both reserves are full"
