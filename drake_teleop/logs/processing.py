@@ -603,7 +603,7 @@ def _read_log_and_remove_load(
         raise useless_weight_scale_error(log.source)
     if weights != inertias and log.gravity is None:
         where = f"{log.source}: gravity in the sensor frame"
-        raise compensation.unknown_gravity_error(where, "add an orientation, or omit sigma_weight")
+        raise compensation.unknown_gravity_error(where, "add an orientation, or give sigma alone")
     if log.gravity is not None:
         rest = np.zeros_like(log.gravity)
         weightless = contact_wrench(log.wrench, np.zeros(6), -log.gravity, rest, rest, phi)
@@ -706,8 +706,8 @@ def _check_log_if_contact_is_large(
 
 
 def useless_weight_scale_error(where: str) -> DrakeTeleopError:
-    what = "the robot has removed the weight, so that sigma_weight has no effect"
-    return DrakeTeleopError(what, where=where, remedy="omit sigma_weight; sigma scales the inertia")
+    what = "the robot has removed the weight, so that a separate scale of it has no effect"
+    return DrakeTeleopError(what, where=where, remedy="give sigma alone; it scales the inertia")
 
 
 def _resolve_force_scales(

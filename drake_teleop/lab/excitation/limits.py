@@ -321,7 +321,7 @@ def _are_segments_surely_apart(first, second, distance):
     # Sufficient condition for two segments (2, 3): four times the square of the middles' distance.
     (a, along_a), (b, along_b) = _start_and_direction(first), _start_and_direction(second)
     between = minus(minus(plus(a, vector_at(first[1], 0)), b), vector_at(second[1], 0))
-    # (a + b + weights)^2 <= 3 (a^2 + b^2 + weights^2)
+    # (a + b + c)^2 <= 3 (a^2 + b^2 + c^2)
     squares = dot(along_a, along_a) + dot(along_b, along_b) + 4 * distance * distance
     return dot(between, between) > 3 * squares
 

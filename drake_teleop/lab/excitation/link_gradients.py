@@ -25,7 +25,7 @@ from drake_teleop.common.vectors import (
 from drake_teleop.load.regressor import wrench_of_load
 from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, SENSOR_MOTION_SIZE
 
-#: Size of a link's seed: derivatives by s, omega, alpha, p, theta, and v, w of virtual power.
+#: Size of a link's adjoint (`seed`): derivatives by s, omega, alpha, p, theta, virtual v and w.
 ADJOINT_SIZE = 21
 _S_INDEX, _OMEGA_INDEX, _ALPHA_INDEX, _P_INDEX, _THETA_INDEX = 0, 3, 6, 9, 12
 _VIRTUAL_V_INDEX, _VIRTUAL_W_INDEX = 15, 18

@@ -380,8 +380,8 @@ def nearest_sensor_axis(direction: Array) -> str:
 def sensor_axis_along_tool(arm: ArmModel, p_SScm_S: Array) -> str:
     """Return the axis of S along the tool, with the sign away from the arm.
 
-    It is nearest to the tool's centre of mass `p_SScm_S` [m]; if that is 0, to the last joint's
-    axis. Away means from the point of this axis that is nearest to the joint before.
+    It is nearest to the tool's centre of mass `p_SScm_S` [m]; if that is near So or oblique, to the
+    last joint's axis. Away means from the point of that axis that is nearest to the joint before.
     """
     R = arm.table[-2:, ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(2, 3, 3)
     p = arm.table[-2:, TRANSLATION_COLUMN : TRANSLATION_COLUMN + 3]

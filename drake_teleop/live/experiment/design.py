@@ -48,7 +48,7 @@ class Condition:
 
 @dataclass
 class _CommonTaskFields:
-    scenario: str = plain("touch", "scenario: shipped name, or path of a YAML file from here")
+    scenario: str = plain("touch", "scenario: shipped name, or YAML file relative to this file")
     trials: int = quantity(40, "1", 1, 1000, "number of trials of each condition")
     practice: int = quantity(
         4, "1", 0, 100, "number of practice trials, which show the right answer"

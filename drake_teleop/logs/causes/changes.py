@@ -356,7 +356,7 @@ def _block_residuals_due_to_motion_errors(
 
 
 def replace_steps_by_contact(fit: FittedModel) -> FittedModel:
-    """Replace offset steps by a contact if two cancel, or if the residual beside one is large."""
+    """Replace step changes by a contact if two cancel, or if the residual beside one is large."""
     steps = sorted(enumerate(fit.model.steps), key=lambda x: x[1].time)
     first, last = float(fit.means.t[0]), float(fit.means.t[-1])
     borders = [(-1, first), *((i, step.time) for i, step in steps), (-1, last)]

@@ -222,7 +222,7 @@ def _findings_on_other_wrenches(
         lines = " and ".join(f"wrench.{kind}.columns: {other[kind]}" for kind in pair)
         frame = "base" if re.search(_BASE_FORCE_REGEX, labels[other["force"][0]][0]) else "sensor"
         text = f"the wrench is read from {taken}; another wrench is in {', '.join(sorted(used))}"
-        yield Finding("other wrench", f"{text}; to change, set {lines} and wrench.frame: {frame}")
+        yield Finding("other wrench", f"{text}; to use it, set {lines} and wrench.frame: {frame}")
 
 
 def _normalized_name_and_unit(name: str) -> tuple[str, str]:

@@ -165,8 +165,8 @@ def write_log(log: Log, path: str | Path) -> None:
 def describe_canonical(path: Path, table: Table) -> Description:
     """Return the description of a canonical table (columns `t`, `f_x` ...).
 
-    Rows with orientation or specific force are static poses in two cases: without `t`, if the
-    median speed is below 0.05 rad/s; below 5 Hz, if a fifth of the steps tilt by over 10 deg.
+    Rows with orientation or specific force are static poses without `t`, or below 5 Hz if a fifth
+    of the steps tilt by over 10 deg. A given angular speed must have a median below 0.05 rad/s.
     """
     if not {"t", *WRENCH_COLUMNS} & set(table.columns):
         what = "is not a canonical log: it has none of the columns t, f_x ... tau_z"

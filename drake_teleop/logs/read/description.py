@@ -181,7 +181,7 @@ class Imu(_RecordedStreamDescription):
             raise ValueError("an IMU has no signal: give specific_force, angular_velocity, or both")
         uses_force = self.is_mounting_auto or self.sign != 1 or any(self.position)
         if uses_force and not self.specific_force:
-            raise ValueError("imu.sign, position and frame auto require specific_force: add it")
+            raise ValueError("sign, position, auto require specific_force: add it, or remove them")
         return self
 
     @property
