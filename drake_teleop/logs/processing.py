@@ -766,6 +766,6 @@ def detect_log(
     _reject_static_log(found)
     if found.detection is None:
         what = f"{len(found.log)} samples are too few to separate contact from noise"
-        remedy = f"give a record of more than {MIN_NOISE_FLOOR_SAMPLES} samples besides its ends"
+        remedy = f"give a record of at least {MIN_NOISE_FLOOR_SAMPLES} samples besides its ends"
         raise DrakeTeleopError(what, where=found.log.source, remedy=remedy)
     return DetectedLog(**vars(found.detection), eliminated=found)

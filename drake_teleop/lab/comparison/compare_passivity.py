@@ -150,7 +150,7 @@ def longest_stable_round_trip(
 
 
 def base_scenario(scenario: str | Path, seed: int) -> Scenario:
-    """Return the scenario without environment, contact detection and load estimator."""
+    """Return the scenario at common rates, without environment, detection and estimator."""
     given = LoadScenario(scenario).without_environment()
     check_can_press(given)
     return replace(

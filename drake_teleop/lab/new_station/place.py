@@ -399,7 +399,7 @@ def opposite_axis(axis: str) -> str:
 def tool_frame_advice(
     model: Path, frame: str, axis: str, *, is_along_tool: bool = True, is_site: bool = False
 ) -> str:
-    """Return a text on how to add a frame with z along `axis` of sensor frame or MJCF site."""
+    """Return how to add a frame with z along `axis` of sensor frame or MJCF site; "" for z."""
     if axis == "z":
         return ""
     R_SA, name = R_SA_BY_AXIS[axis], f"{frame}_z_to_tool"

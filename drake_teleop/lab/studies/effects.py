@@ -298,7 +298,7 @@ def values_by_seed(rows: pl.DataFrame, measure: str, by: str = "point") -> Array
 
 
 def pareto_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
-    """Return means, half widths, "complete" and "front" flags by point, or None."""
+    """Return means, half widths, "complete" and "front" by point; None without the measures."""
     import polars as pl
 
     if not set(PARETO_MEASURES) <= set(study.measures) or rows.is_empty():
