@@ -26,7 +26,7 @@ class SlotAllocator:
         if self._next > self._size:
             raise IndexError(
                 f"SlotAllocator: {self._next} places are required, but the vector has {self._size};"
-                " increase its size"
+                " reserve fewer"
             )
         return slice(first, self._next)
 
