@@ -137,7 +137,7 @@ def drive(
 
         run_drive_command(scenario, record=record, **options)
         return
-    option.refuse_given_options("record", remedy="remove --record; --results is its folder")
+    option.refuse_given_options("record", remedy="remove --record; give the folder as --results")
     if simulated:
         unused = ("participant", "port", "no_browser", "device")
         option.refuse_given_options(*unused, remedy="remove it or --simulated")

@@ -12,6 +12,7 @@ from test_reading_assembly import DT as WRENCH_DT
 from test_reading_assembly import X_FS, StreamStub, played, truth
 
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.robots import assembly
 from drake_teleop.robots.assembly import (
     DELAY_SAMPLE_PERIOD_S,
     DelayTracker,
@@ -115,26 +116,34 @@ def test_another_load_takes_over_the_delay_and_tracks_it() -> None:
     stub.read = lambda timeout_s: None  # the stream ends at once
     streams = WrenchAndMotionStreams(stub)
     other = replace(load(), offsets=OFFSETS - 30.0)
-    assembly = ReadingAssembler(streams, X_FS=X_FS, track=other, delay_s=0.001)
-    for each in played(assembly, 0.5, later=0.004):
-        assert each.t < 0.5 and assembly.delay_s == 0.001  # no sample agrees with this load
-    compensate_stream(assembly, Compensator(load(), WRENCH_DT), ListSink())
-    assert assembly.delay_s == 0.001
-    list(played(assembly, 1.6, later=0.004))
-    assert assembly.delay_s == pytest.approx(0.004, abs=3e-4)
+    tracked = ReadingAssembler(streams, X_FS=X_FS, track=other, delay_s=0.001)
+    for each in played(tracked, 0.5, later=0.004):
+        assert each.t < 0.5 and tracked.delay_s == 0.001  # no sample agrees with this load
+    compensate_stream(tracked, Compensator(load(), WRENCH_DT), ListSink())
+    assert tracked.delay_s == 0.001
+    list(played(tracked, 1.6, later=0.004))
+    assert tracked.delay_s == pytest.approx(0.004, abs=3e-4)
     fixed = ReadingAssembler(streams, X_FS=X_FS, delay_s=0.002)
     fixed.track_delay_with(load())
+    played(fixed, 1.6, later=0.004)
     assert fixed.delay_s == 0.002
+
+
+def test_the_same_load_does_not_restart_the_tracking(monkeypatch: pytest.MonkeyPatch) -> None:
+    known, streams = load(), WrenchAndMotionStreams(StreamStub(WRENCH, POSE))
+    tracked = ReadingAssembler(streams, X_FS=X_FS, track=known)
+    monkeypatch.setattr(assembly, "DelayTracker", lambda *_: pytest.fail("restarted"))
+    tracked.track_delay_with(known)
 
 
 @pytest.mark.slow
 def test_assembly_tracks_an_unknown_delay() -> None:
     """Poses are stamped 4 ms late."""
-    assembly = ReadingAssembler(
+    tracked = ReadingAssembler(
         WrenchAndMotionStreams(StreamStub(WRENCH, POSE)), X_FS=X_FS, track=load()
     )
-    good = [each for each in played(assembly, 1.6, later=0.004) if not each.flags]
-    assert assembly.delay_s == pytest.approx(0.004, abs=2e-4)
+    good = [each for each in played(tracked, 1.6, later=0.004) if not each.flags]
+    assert tracked.delay_s == pytest.approx(0.004, abs=2e-4)
     assert good[-1].t > 1.6 - 0.035 - WRENCH_DT
     wanted = np.array([truth(each.t)[1] for each in good[-50:]])
     motion = np.array([each.values[6:] for each in good[-50:]])

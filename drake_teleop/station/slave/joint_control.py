@@ -40,7 +40,9 @@ class PositionInterface:
     max_speed: float = quantity(
         math.pi, "rad/s", 1e-3, 100.0, "joint speed limit, unless the arm's own is lower"
     )
-    max_acceleration: float = quantity(40.0, "rad/s^2", 1e-2, 1e4, "limit unless the arm's is less")
+    max_acceleration: float = quantity(
+        40.0, "rad/s^2", 1e-2, 1e4, "limit of joint acceleration, unless the arm's own is lower"
+    )
     drive_bandwidth_hz: float = quantity(30.0, "Hz", 0.1, 1e3, "drives' bandwidth; sets stiffness")
 
     def check(self, where: str, rate: float) -> None:

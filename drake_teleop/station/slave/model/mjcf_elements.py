@@ -38,7 +38,7 @@ class Attributes(dict[str, str]):
     def numbers(
         self, name: str, default: tuple[float, ...], max_magnitude: float = math.inf
     ) -> list[float]:
-        """Return numbers of attribute `name`, filled from `default`; report above max_magnitude."""
+        """Return the numbers of attribute `name`; report invalid ones and return `default`."""
         values, fault = parse_numbers(self.get(name)), ""
         if not all(map(math.isfinite, values)):
             fault = "is not a list of numbers"
