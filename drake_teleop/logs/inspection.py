@@ -135,14 +135,14 @@ def _correct_and_write_draft(draft: Draft, path: Path, summary: dict[str, Any]) 
     try:
         load_description(path)
     except DrakeTeleopError as error:
-        lacking.append(str(error).removeprefix(f"{path}: "))
+        lacking.append(str(error).removeprefix(str(path)).lstrip(": "))
     if not lacking:
         _correct_draft_by_data(draft, path, summary)
         return
     text = draft.text()
     for message in lacking:
-        summary["findings"].append({"name": "incomplete", "message": f"the draft has {message}"})
-        text += f"# {to_one_line(f'INCOMPLETE, this has {message}')}\n"
+        summary["findings"].append({"name": "incomplete", "message": f"{path.name}: {message}"})
+        text += f"# {to_one_line(f'INCOMPLETE: {message}')}\n"
     write_text(path, _append_checksum(text))
 
 

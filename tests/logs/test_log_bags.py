@@ -305,7 +305,7 @@ def test_inspecting_a_bag_lists_its_topics_and_drafts_a_description(
 def test_draft_of_a_bag_without_wrench_topic_has_a_placeholder(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "run1", {"/odometry": islice(poses("Odometry"), 5)})
     (finding,) = inspect_command(bag, tmp_path / "out", quiet=True)["findings"]
-    assert finding["message"].startswith("the draft has no wrench: add wrench")
+    assert finding["message"].startswith("draft.yaml: no wrench: add wrench")
     draft = yaml.safe_load((tmp_path / "out" / "draft.yaml").read_text())
     assert draft == {"pose": {"file": "../run1", "topic": "/odometry"}}
 

@@ -402,9 +402,9 @@ def test_force_and_torque_are_those_of_one_sensor() -> None:
         (
             ["qw", "qx", "qy", "qz"],
             {"pose"},
-            ["the draft has no wrench: add wrench"],
+            ["draft.yaml: no wrench: add wrench"],
         ),
-        (["Fx", "Fy", "Fz", "Tx", "Ty", "Tz"], {"wrench"}, ["the draft has a wrench without kine"]),
+        (["Fx", "Fy", "Fz", "Tx", "Ty", "Tz"], {"wrench"}, ["draft.yaml: a wrench without kine"]),
         (["Fx", "Fy", "Fz", "wx"], {"wrench"}, ["not recognized: FILL IN", "without kinematics"]),
         (["a", "b"], {"wrench"}, ["not recognized: FILL IN", "without kinematics"]),
     ],
@@ -420,7 +420,8 @@ def test_draft_has_the_available_streams_and_lists_missing_ones(
     assert [found["name"] for found in summary["findings"]] == ["incomplete"] * len(missing)
     for words, found in zip(missing, summary["findings"], strict=True):
         assert words in found["message"]
-        assert f"# INCOMPLETE, this has {found['message'].removeprefix('the draft has ')}" in text
+        assert f"# INCOMPLETE: {found['message'].removeprefix('draft.yaml: ')}" in text
+        assert str(tmp_path) not in found["message"]
 
 
 def test_unreadable_input_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
